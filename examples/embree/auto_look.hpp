@@ -1,5 +1,5 @@
-// The look of a volume that nobody has described: over which values, in which colours and how dense, from its
-// histogram. All of it is a function of the whole volume, and so the same on all ranks.
+// The default look of a volume, from its histogram: the range of values to show, their colours and their opacity. It
+// depends only on the whole volume, so it is the same on all ranks.
 #pragma once
 
 #include "color_maps.hpp"
@@ -18,7 +18,7 @@ namespace example {
 // How many voxels there are of each value, in bins of equal width.
 class Histogram {
 public:
-    // Of values from `lo` up; the outermost bins have what lies beyond.
+    // The bins begin at `lo`. Values beyond them are counted in the outermost bins.
     Histogram(float lo, float width, std::size_t bins) : lo_(lo), width_(width), counts_(bins) {}
     explicit Histogram(float lo, float width, std::vector<std::uint64_t> counts)
         : lo_(lo), width_(width), counts_(std::move(counts))
@@ -42,7 +42,7 @@ public:
             sum += counts_[i];
         return sum;
     }
-    // The bin below which `part` of the voxels of bin `from` and those above it lie.
+    // The bin that has the quantile `part` of the voxels in bin `from` and above.
     std::size_t quantileBin(double part, std::size_t from = 0) const
     {
         const double before = part * static_cast<double>(total(from));
@@ -54,7 +54,7 @@ public:
         }
         return counts_.size() - 1;
     }
-    // Within the bin as if its voxels were spread evenly.
+    // The value of that quantile, as if the voxels of a bin were spread evenly in it.
     float quantile(double part, std::size_t from = 0) const
     {
         const std::size_t bin = quantileBin(part, from);
@@ -65,8 +65,8 @@ public:
         return lowerEdge(bin) + width_ * static_cast<float>(std::clamp(before / inBin, 0.0, 1.0));
     }
 
-    // The first bin that is no background. Background is a peak that stands out, of the value that most voxels have;
-    // it ends at the knee of the curve behind it (the triangle of Zack, Rogers and Latt, 1977). 0 if there is none.
+    // The first bin above the background; 0 if there is no background. Background is a distinct peak at the most
+    // frequent value; it ends at the knee of the curve after the peak (triangle method of Zack, Rogers and Latt, 1977).
     std::size_t endOfBackground() const
     {
         std::vector<double> smooth(counts_.size());
@@ -96,10 +96,10 @@ private:
 
 namespace detail {
 
-// The values in this rank's share of the rows of a volume's lattice, of up to 512 voxels each.
+// The values of this rank's share of some rows of a volume, which lie on a lattice; up to 512 voxels of each row.
 struct LatticeRows {
     std::size_t length = 0; // of a row
-    int stride = 1;         // between its voxels
+    int stride = 1;         // from one of its voxels to the next
     std::vector<float> values;
 };
 
@@ -137,11 +137,11 @@ inline Histogram countedOver(const VolumeSource& source, const LatticeRows& latt
                              const Loaders& loaders)
 {
     const bool isWhole = isInteger(source.info.type);
-    // Bins of integers have equally many of them each.
+    // For integers, each bin holds equally many of them.
     const float most = 2048, width = isWhole ? std::max(1.0f, std::ceil((hi - lo + 1) / most)) : (hi - lo) / most;
     const std::size_t bins =
         static_cast<std::size_t>(std::clamp(std::ceil((hi - lo) / width) + isWhole, 1.0f, most + 1));
-    // Each rank adds its counts behind those of the ranks before.
+    // The counts of all ranks, one rank after the other.
     const std::vector<std::uint64_t> ofRanks = loaders.gatherOf<std::uint64_t>([&] {
         Histogram mine(lo, width, bins);
         for (const float value : lattice.values)
@@ -154,7 +154,7 @@ inline Histogram countedOver(const VolumeSource& source, const LatticeRows& latt
     return Histogram(lo, width, std::move(sums));
 }
 
-// Collective. Where nearly all voxels have values that are close to each other, it is of these.
+// Collective. If the values of nearly all voxels are close together, the histogram covers only these.
 inline Histogram histogramOf(const VolumeSource& source, const LatticeRows& lattice, const Loaders& loaders)
 {
     const float greatest = source.info.maximum;
@@ -171,8 +171,8 @@ inline Histogram histogramOf(const VolumeSource& source, const LatticeRows& latt
     return histogram;
 }
 
-// Collective: the sum of `density` along a row, in 1/256 of the largest extent, as the mean over the rows that have
-// anything; 0 if none has.
+// Collective: the sum of `density` along a row, in 1/256 of the largest extent, averaged over the rows that have a
+// density; 0 if none has.
 template <class Density>
 double meanDepth(const VolumeSource& source, const LatticeRows& lattice, const Loaders& loaders, const Density& density)
 {
@@ -201,17 +201,17 @@ double meanDepth(const VolumeSource& source, const LatticeRows& lattice, const L
     return rows > 0 ? static_cast<double>(sum) / unit / static_cast<double>(rows) : 0;
 }
 
-// How dense a normalised value is, beside the densest. `noise`: the part of the range, of a diverging map of either
-// half from the middle, that is background.
+// The density of a normalised value, relative to the densest. `noise`: the part of the range that is background; for a
+// diverging map, the part of each half, from the middle.
 inline float densityOf(float value, bool isDiverging, float noise)
 {
-    const float least = std::max(noise, 0.01f); // so that what is no more than the least is transparent
+    const float least = std::max(noise, 0.01f); // so that the least values are transparent
     const float far = ((isDiverging ? std::fabs(2 * value - 1) : value) - least) / (1 - least);
     const float v = std::clamp(far, 0.0f, 1.0f);
     return v * std::sqrt(v);
 }
 
-// The colours of a map at as many points as its density wants.
+// Transfer points with the colours of a map, and opacities for that thickness.
 inline TransferPoints pointsOf(const ColorMap& map, double thickness, float opacity, float noise = 0)
 {
     TransferPoints colors;
@@ -262,9 +262,9 @@ inline bool looksLikeTomography(const VolumeInfo& info, const Histogram& histogr
 
 } // namespace detail
 
-// Collective: the range to show by default. From the end of the background to where 0.2 % of what is above it lie
-// beyond; of a volume without background, all but 1 % at each end. Of values on both sides of zero that a diverging map
-// is to show, as far to one side as to the other. None if all voxels are alike.
+// Collective: the range to show by default. It begins at the end of the background and leaves out the upper 0.2 % of
+// the voxels above that; without a background it leaves out 1 % at each end. For a diverging map and values on both
+// sides of zero it is symmetric about zero. None if all voxels have the same value.
 inline std::optional<ShownRange> shownRange(const VolumeSource& source, const FileLook& choice, bool isDiverging,
                                             const detail::LatticeRows& lattice, const Loaders& loaders)
 {
@@ -295,8 +295,8 @@ inline std::optional<ShownRange> shownRange(const VolumeSource& source, const Fi
     return range;
 }
 
-// Collective: the look that is asked for, or the best that the histogram gives. Throws std::runtime_error, the same on
-// all ranks.
+// Collective: the look that `choice` asks for; what it leaves open comes from the histogram. Throws std::runtime_error,
+// the same on all ranks.
 inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, const Loaders& loaders)
 {
     const VolumeInfo& info = source.info;
@@ -313,7 +313,7 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
             preset = &p;
     const detail::LatticeRows lattice = detail::readLattice(source, loaders);
     const auto range = shownRange(source, choice, map && map->isDiverging, lattice, loaders);
-    if (!range && isFree) // nothing to go by
+    if (!range && isFree) // there is nothing to choose by
         return look;
     if (range) {
         look.lo = range->lo;
@@ -332,7 +332,7 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
         const double depth = detail::meanDepth(source, lattice, loaders, [&](float value) {
             return detail::densityOf((value - look.lo) * look.scale(), map->isDiverging, noise);
         });
-        // So that on the way through what there is to see e^-2.5 of the light is left.
+        // So that e^-2.5 of the light is left on the way through all that is visible.
         look.points = detail::pointsOf(*map, depth > 0 ? std::clamp(2.5 / depth, 0.004, 3.0) : 1.0, opacity, noise);
         if (choice.color && choice.transfer.empty())
             for (TransferPoint& p : look.points)
@@ -345,7 +345,7 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
                                    c.z, opacity * p.opacity});
         }
         look.points = detail::linearPoints(look.points);
-        // Nobody knows the unit of 8-bit values, and the range is as good.
+        // 8-bit values have no known unit, so they keep the range from above.
         const float shift = detail::hounsfieldShift(info);
         if (!choice.range && info.type != VoxelType::UInt8) {
             look.lo = leastHounsfield + shift;

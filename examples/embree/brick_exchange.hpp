@@ -1,4 +1,4 @@
-// The way of primitives from the ranks that have read them to those that render them.
+// Sends primitives from the ranks that have read them to the ranks that render them.
 #pragma once
 
 #include "bricks.hpp"
@@ -11,7 +11,7 @@
 
 namespace example {
 
-// The ranks that hold the brick of a cell: `count` in a row from the first on, cyclically.
+// The ranks that hold the brick of a cell: `count` consecutive ranks from `first` on, cyclically.
 struct Holders {
     int first = 0, count = 1;
 };
@@ -40,7 +40,7 @@ inline void pack(std::uint32_t cell, const BrickSpheres& part, Loaders::Bytes& b
     Loaders::pack(part.primitives, bytes);
 }
 
-// The part of the object with this geometry: that which is there, or a new one.
+// Returns the part of the object with this geometry; adds one if there is none.
 template <class Part, class Object>
 Part& partWith(std::vector<Part>& parts, const std::vector<Object>& objects, std::uint32_t geometry)
 {
@@ -68,9 +68,9 @@ inline void unpackMesh(const std::byte*& at, BrickMesh& part)
 
 } // namespace detail
 
-// Collective: for each of all cells, by its number, what the ranks have of its meshes and spheres in parts; empty for
-// cells that this rank does not hold. Primitives are in the order of the files. `reaches` as reachOf() has them. The
-// parts in `scene` are gone then.
+// Collective: returns, for each cell by number, the primitives of those objects that the ranks have read in parts;
+// nothing for cells that this rank does not hold. Primitives are in the order of the files. `reaches`: reachOf() of
+// each cell. Removes the parts from `scene`.
 inline std::vector<CellSurfaces> exchangeBricks(Scene& scene, const std::vector<Holders>& holders,
                                                 const std::vector<Box>& reaches, const Loaders& loaders)
 {
@@ -92,7 +92,7 @@ inline std::vector<CellSurfaces> exchangeBricks(Scene& scene, const std::vector<
                                  parts[static_cast<std::size_t>((held.first + i) % ranks)]);
         }
     };
-    loaders.gatherOf<char>([&] { // object by object, as each is gone then
+    loaders.gatherOf<char>([&] { // object by object, to free each when it is packed
         for (MeshObject& object : scene.meshes)
             if (object.isPart) {
                 Box box;

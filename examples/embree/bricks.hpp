@@ -65,7 +65,7 @@ inline void addVolume(Brick& brick, const VolumeObject& object)
         const float low = component(part.lo, i), high = component(part.hi, i);
         const float first = scale > 0 ? low : high, behind = scale > 0 ? high : low;
         const int last = object.source.info.dims[axis] - 1;
-        // One voxel before and two behind the first of a cell are what its gradients use.
+        // Gradients in a cell use one voxel before its first voxel, and two voxels behind.
         const auto voxel = [&](float world, float slack) {
             return static_cast<int>(
                 std::floor(std::clamp((world - offset) / scale + slack, -1.0f, static_cast<float>(last) + 1.0f)));
@@ -144,18 +144,19 @@ inline void addSpheres(std::vector<BrickSpheres>& spheres, const SphereObject& o
 
 } // namespace detail
 
-// Up to where a brick holds primitives: by `ghosts` beyond its cell, for secondary rays.
+// The box in which a brick holds primitives: its cell, and `ghosts` beyond it for secondary rays.
 inline Box reachOf(const Scene& scene, const Box& cell, float ghosts)
 {
-    // More than the rounding of a hit point, so that a hit in the cell has its primitive in the brick.
+    // Also padded by more than the rounding of a hit point, so that the brick has the primitive of each hit in its
+    // cell.
     return cell.padded(
         ghosts
         + 1e-5f * std::max(scene.bounds.largestExtent(), std::max(length(scene.bounds.lo), length(scene.bounds.hi))));
 }
 
 // Loads a rank's part of the scene for one cell. Volumes are read from their source here, and only as far as needed;
-// the scene itself can go when all bricks are loaded. Of meshes and spheres that several ranks have, exchangeBricks()
-// brings the rest.
+// the scene itself can go when all bricks are loaded. The parts of meshes and spheres that ranks have read together
+// come by exchangeBricks().
 inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell, float ghosts = 0)
 {
     Brick brick;

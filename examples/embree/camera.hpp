@@ -1,5 +1,5 @@
-// Camera: a view that orbits around the scene, one position per frame, with or without a lens, motion, two eyes, a
-// dome.
+// Camera: a view that orbits around the scene, with one position per frame. It may have a lens, motion blur, two eyes
+// or a dome.
 #pragma once
 
 #include "vec.hpp"
@@ -22,16 +22,16 @@ struct View {
                                    // with -z up from +y towards +x
     float elevation = 20;          // above the plane at right angles to `up`
     float fieldOfView = 35;        // full vertical angle, before `zoom`
-    float zoom = 1;                // the image is so many times as large, seen from the same place
-    Vec3 up{0, 1, 0};              // of any length but 0
-    bool isUpGiven = false;        // or may be found out from the scene
-    std::optional<Vec3> eye;       // none: by azimuth, elevation and distance
-    std::optional<Vec3> target;    // none: the centre of what there is to see
-    std::optional<float> distance; // from the centre of what there is to see; none: so that all of it is in the image
+    float zoom = 1;                // magnification of the image, from the same place
+    Vec3 up{0, 1, 0};              // of any length except 0
+    bool isUpGiven = false;        // if false, the scene may decide
+    std::optional<Vec3> eye;       // none: from azimuth, elevation and distance
+    std::optional<Vec3> target;    // none: the centre of all that is visible
+    std::optional<float> distance; // from the target; none: so that all that is visible is in the image
     CameraKind kind = CameraKind::Perspective;
     float aperture = 0.05f;  // radius of the lens
-    float focus = 0;         // distance of what is sharp; 0: the centre
-    float shutter = 8;       // degrees that the camera goes on along its orbit while the shutter is open
+    float focus = 0;         // distance of what is sharp; 0: that of the target
+    float shutter = 8;       // degrees of its orbit that the camera moves on while the shutter is open
     float separation = 0.1f; // of the eyes
     float domeAngle = 180;
 };
@@ -41,10 +41,10 @@ struct RenderSettings {
     int frames = 1;                  // of one turn of the camera
     int passes = 1;                  // samples per pixel
     std::uint64_t seed = 1;
-    int aoRays = 0;             // of ambient occlusion, per hit of a surface or sphere; 0: none
+    int aoRays = 0;             // for ambient occlusion, per hit of a surface or sphere; 0: none
     float aoDistance = 0.1f;    // how far they look, in units of the scene's largest extent
-    bool shadows = false;       // of the light, as far as that
-    int pathBounces = 0;        // above 0: surfaces and spheres are opaque and lit by the sky, over so many bounces
+    bool shadows = false;       // of the light, also up to aoDistance
+    int pathBounces = 0;        // above 0: surfaces and spheres are opaque and lit by the sky, over this many bounces
     float opacity = 1;          // of a surface or sphere
     float earlyTermination = 0; // a ray ends when less than this passes through it; 0: when nothing does
     View view;
@@ -53,7 +53,7 @@ struct RenderSettings {
 namespace detail {
 inline constexpr double degree = 3.14159265358979323846 / 180.0;
 
-// The axes of the orbit: up, and at right angles to it where azimuth 0 and azimuth 90 are.
+// The axes of the orbit: up, and at right angles to it the directions of azimuth 0 (front) and azimuth 90 (side).
 struct OrbitAxes {
     Vec3d up, front, side;
 
@@ -79,7 +79,7 @@ inline float shownAngle(const View& view)
 // Returns the point that the camera looks at.
 inline Vec3 targetOf(const Focus& focus, const View& view) { return view.target ? *view.target : focus.box.center(); }
 
-// From the target to the camera, in world space.
+// The distance from the target to the camera, in world space.
 inline double cameraDistance(const Focus& focus, const View& view, int width, int height)
 {
     const Vec3 target = targetOf(focus, view);
@@ -88,7 +88,7 @@ inline double cameraDistance(const Focus& focus, const View& view, int width, in
     const double unit = static_cast<double>(focus.box.largestExtent());
     if (view.distance)
         return static_cast<double>(*view.distance) * unit;
-    // The ball touches the sides of the smaller angle of view, but for a margin.
+    // The ball around all that is visible touches the sides of the smaller angle of view, except for a margin.
     double angle = 0.5 * static_cast<double>(view.fieldOfView) * detail::degree;
     double radius = static_cast<double>(focus.radius) + static_cast<double>(length(target - focus.box.center()));
     const auto narrowTo = [&](double aspect) { angle = std::atan(std::tan(angle) * std::min(1.0, aspect)); };
@@ -96,11 +96,11 @@ inline double cameraDistance(const Focus& focus, const View& view, int width, in
     switch (view.kind) {
     case CameraKind::Perspective:
     case CameraKind::MotionBlur: narrowTo(aspect); break;
-    case CameraKind::DepthOfField: // seen from the lens's rim: room for how far that is from the middle
+    case CameraKind::DepthOfField: // leaves room for the view from the rim of the lens
         narrowTo(aspect);
         radius += static_cast<double>(view.aperture) * unit;
         break;
-    case CameraKind::Stereo: // likewise from an eye, which has half of the image
+    case CameraKind::Stereo: // likewise from each eye, which has half of the image
         narrowTo(0.5 * aspect);
         radius += 0.5 * static_cast<double>(view.separation) * unit;
         break;
@@ -108,10 +108,10 @@ inline double cameraDistance(const Focus& focus, const View& view, int width, in
         angle = std::min(angle, 0.5 * static_cast<double>(view.domeAngle) * detail::degree);
         break;
     }
-    return std::min(1.02 * radius / std::sin(angle), 1000 * unit); // farther away distances have too few digits
+    return std::min(1.02 * radius / std::sin(angle), 1000 * unit); // farther away, floats have too few digits
 }
 
-// Returns the view with azimuth, elevation and distance in place of the eye.
+// Returns the view with azimuth, elevation and distance instead of the eye.
 inline View withoutEye(const Focus& focus, View view)
 {
     if (!view.eye)
@@ -128,11 +128,11 @@ inline View withoutEye(const Focus& focus, View view)
     return view;
 }
 
-// A camera of any kind at one frame: its rays, and for the library, where boxes project to.
+// A camera of any kind at one frame: its rays, and for the library, the part of the image that a box covers.
 class FrameCamera {
 public:
-    // Frame `frame` of `frameCount`, which are a full turn around the target. Throws dfb::InvalidArgument if the eye is
-    // where the target is.
+    // Frame `frame` of `frameCount` frames, which make a full turn around the target. Throws dfb::InvalidArgument if
+    // the eye is where the target is.
     FrameCamera(const Focus& focus, const View& view, int frame, int frameCount, int width, int height)
         : FrameCamera(focus, view, orbit(focus, view, frame, frameCount, width, height), width, height)
     {
@@ -141,7 +141,7 @@ public:
     // The camera without its lens.
     const dfb::PerspectiveCamera& pinhole() const { return pinhole_; }
 
-    // Where all rays begin, if they do.
+    // The point where all rays begin, if there is one.
     std::optional<Vec3> commonEye() const
     {
         const bool isOne =

@@ -1,4 +1,4 @@
-// Cinema: a table of the pictures of an orbit, data.csv, as specification D of Cinema databases has it.
+// Cinema: the table data.csv with the pictures of an orbit, by specification D of Cinema databases.
 #pragma once
 
 #include "camera.hpp"
@@ -12,8 +12,9 @@
 
 namespace example {
 
-// One row for each of `files`, which are the frames of a turn and relative to the folder: phi and theta, the camera's
-// azimuth and elevation in degrees, phi from 0 to 360. Throws std::runtime_error with the file's name.
+// Writes one row for each of `files`, the frames of a turn, with paths relative to the folder. The columns phi and
+// theta are the camera's azimuth and elevation in degrees; phi is from 0 to 360. Throws std::runtime_error with the
+// file's name.
 inline void writeCinema(const std::string& path, const View& view, const std::vector<std::string>& files)
 {
     errno = 0;

@@ -13,7 +13,7 @@ namespace example {
 
 // From the coordinates of a file to the world.
 struct Placement {
-    Vec3 scale{1, 1, 1}; // of volumes: the sides of a voxel; else the same along all axes but for the sign
+    Vec3 scale{1, 1, 1}; // of volumes: the sides of a voxel; else equal along all axes, except for the sign
     Vec3 offset;
 
     // The least and the greatest scale.
@@ -25,8 +25,8 @@ struct Placement {
     }
 };
 
-// Centres the box in [0, 1]^3 with its largest extent 1; the identity if `fit` is false, or the box has no extent or
-// one that is lost beside its distance from 0.
+// Centres the box in [0, 1]^3 with its largest extent 1; the identity if `fit` is false, or if the extent of the box is
+// 0 or too small for floats at its distance from 0.
 inline Placement fitToUnitCube(const Box& box, bool fit)
 {
     Placement placement;
@@ -63,7 +63,7 @@ public:
     }
     Vec3d point(const Vec3d& p) const { return isNone_ ? p : center_ + direction(p - center_); }
     Vec3d pointBack(const Vec3d& p) const { return isNone_ ? p : center_ + directionBack(p - center_); }
-    // The box around a box that is turned.
+    // The box around a box that has been rotated.
     Box box(const Box& b) const
     {
         return around(b, [this](const Vec3d& p) { return point(p); });
@@ -90,7 +90,7 @@ private:
     Vec3d columns_[3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
 };
 
-// A placement, and behind it what a FileLook adds: scale and rotation about the box's centre, then a translation.
+// A placement, followed by what a FileLook adds: scale and rotation about the box's centre, then a translation.
 class FileToWorld {
 public:
     // `box`: of the file, in its own coordinates.
@@ -112,7 +112,7 @@ public:
             return world;
         return toFloat(rotation_.point(center_ + (toDouble(world) - center_) * scale_) + translate_);
     }
-    // A function of the point alone.
+    // Depends on the point only.
     Vec3d toFile(const Vec3& world) const
     {
         Vec3d p = toDouble(world);

@@ -15,7 +15,7 @@ namespace example {
 struct ColorMap {
     const char* name;
     std::vector<std::uint32_t> colors;
-    bool isDiverging; // the middle is what does not stand out
+    bool isDiverging; // the middle of its range is the background
 };
 
 inline const std::vector<ColorMap>& colorMaps()
@@ -38,7 +38,7 @@ inline const std::vector<ColorMap>& colorMaps()
           0xf7b194, 0xf49a7b, 0xec7f63, 0xde614d, 0xcb3e38, 0xb40426},
          true},
         {"grey", {0x202020, 0xffffff}, false},
-        // Ours, for volumes in which nothing is known of the values: from a haze to embers.
+        // Our own, for volumes of which nothing is known: from a haze to embers.
         {"ember", {0x5b7f96, 0x8fb4bf, 0xc9cfae, 0xf0c777, 0xf29a45, 0xe4602c, 0xe0703a, 0xf3a75c, 0xfff0d2}, false},
     };
     return maps;
@@ -50,7 +50,7 @@ inline const std::vector<ColorMap>& colorMaps()
 struct TissuePoint {
     float hounsfield;
     std::uint32_t color; // sRGB
-    float opacity;       // of 1/256 of the volume's largest extent
+    float opacity;       // of a slab as thick as 1/256 of the largest extent
 };
 struct TissuePreset {
     const char* name;
@@ -59,7 +59,7 @@ struct TissuePreset {
 
 inline constexpr float leastHounsfield = -1024, greatestHounsfield = 3071;
 
-// The last is for what looks like a body in a scanner.
+// The last one is for volumes that look like computed tomography of a body.
 inline const std::vector<TissuePreset>& tissuePresets()
 {
     static const std::vector<TissuePreset> presets = {
@@ -84,7 +84,7 @@ inline const std::vector<TissuePreset>& tissuePresets()
     return presets;
 }
 
-// All that --transfer takes beside a file.
+// All names that --transfer takes.
 inline std::vector<std::string> transferNames()
 {
     std::vector<std::string> names;
@@ -103,15 +103,15 @@ inline Vec3 colorOf(std::uint32_t rgb)
     return {channel(16), channel(8), channel(0)};
 }
 
-// As a screen shows a linear colour.
+// A linear colour in sRGB.
 inline Vec3 displayOf(const Vec3& linear)
 {
     const auto srgb = [](float v) { return v <= 0.0031308f ? v * 12.92f : 1.055f * std::pow(v, 1 / 2.4f) - 0.055f; };
     return {srgb(linear.x), srgb(linear.y), srgb(linear.z)};
 }
 
-// Points whose colours are sRGB, between which a screen's colours are linear: as linear RGB, with points between, so
-// that this is still so within a level of 8 bits.
+// Converts points from sRGB to linear RGB. Between the given points sRGB colours are interpolated linearly; added
+// points keep this right within one level of 8 bits.
 inline TransferPoints linearPoints(const TransferPoints& srgb)
 {
     const int parts = 16;

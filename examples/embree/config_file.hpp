@@ -1,4 +1,4 @@
-// Options in files, JSON or TOML to read.
+// Files of options, in JSON or TOML.
 #pragma once
 
 #include <CLI/CLI.hpp>
@@ -12,8 +12,8 @@
 
 namespace example {
 
-// The format of --config: an object of JSON, {"scene": ["a.ply"], "size": "300x200", "spp": 4, "shadows": true}, or the
-// same as TOML, without # in a value.
+// The format of --config: a JSON object, {"scene": ["a.ply"], "size": "300x200", "spp": 4, "shadows": true}, or the
+// same in TOML, without a # in a value.
 class OptionsFile : public CLI::ConfigTOML {
 public:
     // Throws CLI::ConfigError.
@@ -45,7 +45,7 @@ public:
 
 namespace detail {
 
-// An option's value: a number, true or false where it is one, else a text.
+// An option's value: a number, true or false if it is one, otherwise a text.
 inline nlohmann::ordered_json valueOf(const std::string& text)
 {
     const nlohmann::ordered_json value = nlohmann::ordered_json::parse(text, nullptr, false);

@@ -1,9 +1,9 @@
 // ContentCut: bricks that take equally long to render, as an example of a cost function. A scene that is cut by volume
 // gives some ranks more to do than others, as most of its space may be empty, and what is near covers more pixels.
 //
-// The cost of a place is what the rays of a frame do there: samples in blocks of a volume where there is something to
-// see, and hits of surfaces with the rays that these send out. It is reckoned on a coarse grid, from what all ranks
-// know of the scene anyway, for several frames of the run.
+// The cost of a place is the work of a frame's rays there: samples in visible blocks of a volume, and hits of surfaces
+// with the secondary rays that start there. It is estimated on a coarse grid, from what all ranks know about the scene
+// anyway, for several frames of the run.
 #pragma once
 
 #include "renderer.hpp"
@@ -22,7 +22,7 @@ namespace example {
 
 class ContentCut {
 public:
-    // Collective: of meshes and spheres in parts each rank looks at its own.
+    // Collective: each rank looks at its own parts of meshes and spheres.
     ContentCut(const Scene& scene, const SceneInfo& info, const RenderSettings& settings, const Loaders& loaders = {})
         : bounds_(scene.bounds)
     {
@@ -42,8 +42,8 @@ public:
             addView(content, frameCamera(info, settings, view * settings.frames / views).pinhole(), settings);
     }
 
-    // The cells of `count` bricks, which tile the scene's bounds: halves of equal cost, cut along the axis that leaves
-    // the least to the busiest rank, over and over.
+    // The cells of `count` bricks, which tile the scene's bounds. The bounds are cut into halves of equal cost again
+    // and again, each time along the axis that gives the busiest rank the least work.
     std::vector<Box> cells(int count) const
     {
         std::vector<Box> all;
@@ -56,13 +56,13 @@ public:
 
 private:
     static constexpr int finest = 64;   // cells of the grid along the longest axis
-    static constexpr int mostViews = 8; // frames of the run that are looked at
-    // Of all costs, what is shared out by room: a brick takes memory also where it looks empty, and the look was
-    // coarse.
+    static constexpr int mostViews = 8; // frames of the run that are considered
+    // The part of the total cost that is spread evenly over space: a brick takes memory also where it is empty, and the
+    // grid is coarse.
     static constexpr double roomPart = 0.1;
 
-    static constexpr int mostAhead = 8;          // bricks that are cut in all ways before one is chosen
-    static constexpr double thinnest = 1.0 / 16; // of a box's longest side, a side that may be cut
+    static constexpr int mostAhead = 8;          // up to so many bricks, all cuts are tried to the end
+    static constexpr double thinnest = 1.0 / 16; // a side may be cut if it is at least this part of the longest
 
     // A box in cells of the grid, or parts of them.
     struct Grid {
@@ -71,7 +71,7 @@ private:
 
     std::size_t indexOf(std::size_t x, std::size_t y, std::size_t z) const { return (z * size_[1] + y) * size_[0] + x; }
 
-    // Where a coordinate of the world is on the grid.
+    // The position of a world coordinate on the grid.
     double onGrid(float world, int axis) const
     {
         const double lo = static_cast<double>(component(bounds_.lo, axis)),
@@ -80,8 +80,8 @@ private:
         return std::clamp((static_cast<double>(world) - lo) / extent * cells, 0.0, cells);
     }
 
-    // The cost of rays that hit surfaces, without secondary ones. It is summed in units of which doubles hold all
-    // multiples, so that it does not depend on the number of ranks, nor of their order.
+    // The cost of rays that hit surfaces, without secondary rays. It is summed in whole units, which doubles hold
+    // exactly, so the sum does not depend on the number or the order of the ranks.
     std::vector<double> surfaceContent(const Scene& scene, const Loaders& loaders) const
     {
         const double extent = static_cast<double>(bounds_.largestExtent()), unit = extent * extent * 0x1.0p-30;
@@ -96,8 +96,8 @@ private:
                 Box box;
                 for (const Vec3& p : {a, b, c})
                     box.grow(p);
-                // Half of a side, as seen from all sides on average.
-                if (isMine(object) && box.overlaps(bounds_)) // else it is clipped away
+                // Seen from a random side, a triangle covers half of its area on average.
+                if (isMine(object) && box.overlaps(bounds_)) // otherwise it is clipped away
                     add(own, box, 0.25 * static_cast<double>(length(cross(b - a, c - a))) / unit, std::nearbyint);
             }
         for (const SphereObject& object : scene.spheres)
@@ -117,7 +117,7 @@ private:
         return own;
     }
 
-    // Spreads an amount over a box, each part of it rounded by a function.
+    // Spreads an amount over the grid cells in a box; `round` rounds the amount of each.
     void add(std::vector<double>& content, const Box& box, double amount, double (*round)(double)) const
     {
         std::array<std::size_t, 3> first{}, last{};
@@ -128,7 +128,7 @@ private:
             first[a] = std::min(static_cast<std::size_t>(ends[a][0]), size_[a] - 1);
             last[a] = std::min(static_cast<std::size_t>(ends[a][1]), size_[a] - 1);
         }
-        const auto part = [&](std::size_t axis, std::size_t i) { // of the box, along an axis
+        const auto part = [&](std::size_t axis, std::size_t i) { // part of the box in grid cell `i` along an axis
             const auto [lo, hi] = ends[axis];
             if (!(hi > lo))
                 return 1.0;
@@ -144,7 +144,7 @@ private:
     void addVolume(std::vector<double>& content, const VolumeObject& object, double samplesPerLength) const
     {
         const VisibleVoxels visible =
-            object.source.visible ? *object.source.visible : visibleVoxels(object.source); // generated: no file
+            object.source.visible ? *object.source.visible : visibleVoxels(object.source); // generated: none yet
         std::size_t i = 0;
         for (int z = 0; z < visible.blocks[2]; ++z)
             for (int y = 0; y < visible.blocks[1]; ++y)
@@ -173,8 +173,8 @@ private:
                 }
     }
 
-    // Adds the sums of what the content costs when it is seen by this camera: rays lie the closer, the nearer they are
-    // to the eye, and there are none outside of the image. A dome has them all around.
+    // Adds a view: sums of what the content costs when this camera sees it. Rays are denser near the eye, and there are
+    // none outside of the image. A dome has rays all around.
     void addView(const std::vector<double>& content, const dfb::PerspectiveCamera& camera,
                  const RenderSettings& settings)
     {
@@ -230,7 +230,7 @@ private:
         return (z * (size_[1] + 1) + y) * (size_[0] + 1) + x;
     }
 
-    // The sum of all cells that lie before a point of the grid in all three axes.
+    // The sum over all cells that lie before a point of the grid along all three axes.
     double sumBefore(const std::vector<double>& sums, const std::array<double, 3>& at) const
     {
         std::array<std::size_t, 3> cell{};
@@ -271,8 +271,8 @@ private:
         double at = 0;
     };
 
-    // The parts of a box that is cut, for `lower` and `upper` bricks: what a brick of the costlier half has in the
-    // worst view.
+    // The cost per brick of the costlier half of a cut box, in the worst view. The halves are for `lower` and `upper`
+    // bricks.
     double worstOf(const Grid& box, const Cut& cut, int lower, int upper) const
     {
         const auto [a, b] = halves(box, cut);
@@ -289,7 +289,7 @@ private:
         return {a, b};
     }
 
-    // In the world.
+    // In world units.
     double lengthOf(const Grid& box, int axis) const
     {
         const std::size_t i = static_cast<std::size_t>(axis);
@@ -297,7 +297,7 @@ private:
                * static_cast<double>(component(bounds_.extent(), axis));
     }
 
-    // The best place along an axis.
+    // The best cut along an axis.
     Cut balanced(const Grid& box, int axis, int lower, int upper) const
     {
         const std::size_t i = static_cast<std::size_t>(axis);
@@ -318,8 +318,8 @@ private:
         return {axis, 0.5 * (first + last)};
     }
 
-    // The best cut, and what the costliest of the bricks has: exactly down to single bricks for few of them, else as if
-    // the halves could be cut evenly.
+    // The best cut, and the cost of the costliest brick then. For up to `mostAhead` bricks all further cuts are tried;
+    // for more, the halves count as if they could be cut evenly.
     std::pair<Cut, double> best(const Grid& box, int count) const
     {
         if (count == 1) {
@@ -367,7 +367,7 @@ private:
 
     Box bounds_;
     std::array<std::size_t, 3> size_{};
-    std::vector<std::vector<double>> views_; // for each: sums of the parts of its cost before each corner of the grid
+    std::vector<std::vector<double>> views_; // for each view: sums of its cost before each corner of the grid
 };
 
 } // namespace example

@@ -13,8 +13,8 @@
 namespace example {
 namespace detail {
 
-// By number, from 1. The radius is that of van der Waals by Bondi (1964), and of main-group elements that he has not by
-// Mantina et al. (2009), in Angstrom; 0: neither has it.
+// By atomic number, from 1. The van der Waals radius in Angstrom is that of Bondi (1964), or, for main-group elements
+// that he does not list, of Mantina et al. (2009); 0: neither lists it.
 struct Element {
     const char* symbol;
     float radius;
@@ -40,7 +40,7 @@ inline constexpr std::array<Element, 118> elements{
 
 } // namespace detail
 
-// The number of an element by its symbol, in upper or lower case, or by its number; 0 if it is none.
+// The atomic number of an element, from its symbol in upper or lower case or from its number; 0 if it is no element.
 inline int elementNumber(std::string_view word)
 {
     if (word.empty() || word.size() > 3)
@@ -50,7 +50,7 @@ inline int elementNumber(std::string_view word)
         number = c >= '0' && c <= '9' && number >= 0 ? 10 * number + (c - '0') : -1;
     if (number >= 0)
         return number <= static_cast<int>(detail::elements.size()) ? number : 0;
-    // A table over two letters: files have millions of atoms.
+    // A table indexed by two letters, because files have millions of atoms.
     const auto letter = [](char c) {
         return c >= 'a' && c <= 'z' ? c - 'a' + 1 : c >= 'A' && c <= 'Z' ? c - 'A' + 1 : c == '\0' ? 0 : -1;
     };
@@ -69,7 +69,7 @@ inline int elementNumber(std::string_view word)
     return word.size() > 2 ? 0 : numbers[static_cast<std::size_t>(place(word[0], word.size() > 1 ? word[1] : '\0'))];
 }
 
-// In Angstrom: 2 where it is not known, and for what is no element that of carbon.
+// In Angstrom: 2 where it is not known; for words that are no element, that of carbon.
 inline float atomRadius(int element)
 {
     if (element < 1 || element > static_cast<int>(detail::elements.size()))
@@ -78,8 +78,8 @@ inline float atomRadius(int element)
     return radius > 0 ? radius : 2.0f;
 }
 
-// Linear RGB, near the usual one (Corey, Pauling, Koltun) of common elements. Others have one for each, so that their
-// neighbours in the periodic table look different.
+// Linear RGB. Common elements are near their usual colour (Corey, Pauling, Koltun). Each other element has a colour
+// that differs from those of its neighbours in the periodic table.
 inline Vec3 atomColor(int element)
 {
     struct Entry {
@@ -98,7 +98,7 @@ inline Vec3 atomColor(int element)
     for (const Entry& entry : usual)
         if (entry.element == element)
             return entry.color;
-    const double turn = 0.618033988749895 * element; // golden: no two near each other
+    const double turn = 0.618033988749895 * element; // by the golden ratio: no two are close
     const auto channel = [turn](double shift) {
         return static_cast<float>(0.35 + 0.3 * std::cos(2 * 3.14159265358979323846 * (turn + shift)));
     };

@@ -28,9 +28,9 @@ void writeExr([[maybe_unused]] const std::string& path, [[maybe_unused]] const d
         header.insert("comments", Imf::StringAttribute(comment));
         Imf::FrameBuffer pixels;
         const auto width = static_cast<std::size_t>(image.width());
-        // Values of 4 bytes, which lie side by side in a pixel.
+        // Adds channels of 4 bytes, which are adjacent in a pixel.
         const auto add = [&](Imf::PixelType type, std::initializer_list<const char*> names, const void* first) {
-            // OpenEXR has one type for reading and for writing.
+            // OpenEXR uses one type for reading and writing, so it wants a non-const pointer.
             char* at = const_cast<char*>(static_cast<const char*>(first));
             for (const char* name : names) {
                 header.channels().insert(name, Imf::Channel(type));

@@ -1,5 +1,5 @@
-// FileLook: how one file is shown, and where: part of a clip box, colour, opacity, placement, and of a volume its
-// transfer function, range and isosurfaces. On the command line it stands behind the file's name:
+// FileLook: how and where one file is shown: its clip box, colour, opacity and placement, and for a volume its transfer
+// function, range and isosurfaces. On the command line it follows the file's name:
 // mesh.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1
 #pragma once
 
@@ -16,7 +16,7 @@
 
 namespace example {
 
-// A value of the data, or a percentage of its voxels that are smaller.
+// A value of the data, given directly or as the percentage of voxels that are smaller.
 struct RangeEnd {
     float value = 0;
     bool isPercent = false;
@@ -24,12 +24,12 @@ struct RangeEnd {
 
 struct FileLook {
     std::optional<Vec3> color;    // linear RGB
-    std::optional<float> opacity; // of surfaces; of a volume a factor
-    Vec3 translate;               // in the world, after the next two, which are about the centre of the file's box
+    std::optional<float> opacity; // of surfaces; for a volume a factor
+    Vec3 translate;               // in the world, after the next two, which are about the centre of its box
     float scale = 1;
     Vec3 rotate;             // degrees about x, then y, then z
     std::optional<Box> clip; // in the file's own coordinates; what is outside is not shown
-    std::string transfer;    // a name, or a file's; empty: by the histogram
+    std::string transfer;    // a name or a file; empty: from the histogram
     std::optional<std::array<RangeEnd, 2>> range;
     std::vector<float> isovalues; // if there are any and no `transfer`, they are all that is shown of a volume
 
@@ -45,7 +45,7 @@ struct SceneFile {
 
 namespace detail {
 
-// A finite number, and nothing else.
+// The finite number that the whole text is; none if it is not one.
 inline std::optional<float> numberOf(const std::string& text)
 {
     char* end = nullptr;
@@ -65,7 +65,7 @@ inline std::vector<std::string> splitAt(const std::string& text, char separator)
     return parts;
 }
 
-// Numbers with commas between them; of another count than `count`, if that is not 0, there are none.
+// The numbers of a comma-separated list; none if there are not `count` of them, unless that is 0.
 inline std::vector<float> numbersOf(const std::string& text, std::size_t count)
 {
     std::vector<float> numbers;
@@ -80,7 +80,7 @@ inline std::vector<float> numbersOf(const std::string& text, std::size_t count)
 
 } // namespace detail
 
-// A colour as a screen shows it, three numbers from 0 to 1 or #rrggbb, as linear RGB; none if it is no colour.
+// The linear RGB of an sRGB colour, given as three numbers from 0 to 1 or as #rrggbb; none if it is no colour.
 inline std::optional<Vec3> displayColor(const std::string& text)
 {
     if (text.size() == 7 && text[0] == '#'
@@ -96,8 +96,8 @@ inline std::optional<Vec3> displayColor(const std::string& text)
     return c.empty() ? std::nullopt : std::optional<Vec3>(detail::linearOf({c[0], c[1], c[2]}));
 }
 
-// Sets what `key` names. Returns false if there is no such key; throws std::invalid_argument, without the key, if the
-// value is none for it.
+// Sets what `key` names. Returns false if there is no such key. Throws std::invalid_argument, whose text does not name
+// the key, if the value is wrong for it.
 inline bool setLook(FileLook& look, const std::string& key, const std::string& value)
 {
     const auto wrong = [&value](const char* what) { throw std::invalid_argument("'" + value + "' is not " + what); };
@@ -164,9 +164,9 @@ inline bool setLook(FileLook& look, const std::string& key, const std::string& v
     return true;
 }
 
-// A word of the command line: a path, and behind it :key=value as often as it takes. A word that as a whole ends as a
-// file of a scene does is a path; else what stands before the first of the last parts of the form `:key=value` is. So
-// paths may have colons. Throws std::invalid_argument if a key is unknown or its value is wrong.
+// Parses a word of the command line: a path, followed by any number of :key=value. If the whole word ends like a scene
+// file, it is a path. Otherwise the path ends where the trailing parts of the form `:key=value` begin. So paths may
+// have colons. Throws std::invalid_argument if a key is unknown or its value is wrong.
 inline SceneFile parseSceneFile(const std::string& word, const std::vector<std::string>& endings)
 {
     const auto endsAsFile = [&endings](const std::string& path) {

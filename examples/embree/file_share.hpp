@@ -13,7 +13,7 @@
 
 namespace example {
 
-// Of a file. Throws std::runtime_error if it cannot be read.
+// Throws std::runtime_error if the file cannot be read.
 inline std::uint64_t fileSize(const std::string& path)
 {
     std::ifstream stream(path, std::ios::binary | std::ios::ate);
@@ -27,7 +27,7 @@ inline std::uint64_t fileSize(const std::string& path)
 inline std::string readBytes(const std::string& path, std::uint64_t begin, std::uint64_t end, const Loaders& loaders)
 {
     std::ifstream stream;
-    stream.rdbuf()->pubsetbuf(nullptr, 0); // no byte that nobody asked for
+    stream.rdbuf()->pubsetbuf(nullptr, 0); // without a buffer, only these bytes are read
     stream.open(path, std::ios::binary);
     std::string bytes(static_cast<std::size_t>(end - begin), '\0');
     stream.seekg(static_cast<std::streamoff>(begin));
@@ -37,8 +37,8 @@ inline std::string readBytes(const std::string& path, std::uint64_t begin, std::
     return bytes;
 }
 
-// The lines that begin in this rank's share of the bytes [first, size) of a file. Throws std::runtime_error where lines
-// end with \r alone, or are longer than 1 MiB: files that cannot be shared.
+// The lines that begin in this rank's share of the bytes [first, size) of a file. Throws std::runtime_error if lines
+// end with \r alone or are longer than 1 MiB: such files cannot be shared.
 inline std::string readLinesOfShare(const std::string& path, std::uint64_t first, std::uint64_t size,
                                     const Loaders& loaders)
 {
@@ -49,7 +49,7 @@ inline std::string readLinesOfShare(const std::string& path, std::uint64_t first
     end += first;
     if (begin == end)
         return {};
-    // With the byte before, which tells whether a line begins here.
+    // Reads also the byte before, which tells whether a line begins here.
     const std::uint64_t before = begin > first ? 1 : 0;
     std::string bytes = readBytes(path, begin - before, end, loaders);
     const std::size_t start = before == 0 ? 0 : bytes.find('\n') + 1;

@@ -36,7 +36,7 @@ public:
         }
     }
 
-    // One file per frame.
+    // Whether there is one file per frame.
     bool isPattern() const { return isPattern_; }
 
     std::string path(int frame) const

@@ -1,4 +1,4 @@
-// Frames where each rank has a part of the scene. Those where it has the whole are in frames_single.cpp.
+// Frames where each rank has a part of the scene. frames_single.cpp has those where each rank has the whole scene.
 #include "frames_by.hpp"
 
 namespace example {

@@ -1,4 +1,5 @@
-// FramesBy: the frames of a run with certain operations. It has source files of its own, as it takes long to compile.
+// FramesBy: the frames of a run, for given tile and pixel operations. Its instances are in source files of their own,
+// because they take long to compile.
 #pragma once
 
 #include "camera.hpp"
@@ -19,7 +20,7 @@
 
 namespace example {
 
-// The tiles have all that the renderer can say; what no image has does not travel.
+// The tiles have all channels that the renderer can fill. Channels that no image has are not sent.
 inline constexpr dfb::ChannelMask tileChannels = dfb::allChannels & ~dfb::farChannel;
 using Blend = dfb::BasicAlphaBlend<64, tileChannels>;
 using Single = dfb::BasicImageParallel<64, tileChannels>;
@@ -30,7 +31,7 @@ enum class LoopOver { Tiles, Bricks, BricksInOrder, DeepBricks };
 
 template <LoopOver loopOver, class TileOp, class PixelOp>
 class FramesBy final : public RunFrames {
-    // It is made over a connection, whatever the transport of that is.
+    // It is made over a connection, so this transport need not be that of the connection.
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, dfb::InprocTransport>;
     static constexpr bool hasWall = std::is_same_v<PixelOp, dfb::ToWall> || std::is_same_v<PixelOp, ToneMapToWall>;
 
@@ -41,7 +42,7 @@ public:
     {
         PixelOp pixelOp{};
         if constexpr (hasWall) {
-            // Of what a wall shows no rank has the whole.
+            // No rank has the whole image of a wall.
             const auto format = wantsFloat(o) ? dfb::OutputFormat::RGBA32F : dfb::OutputFormat::SRGBA8;
             wall_ =
                 std::make_unique<dfb::DisplayWall>(connection, wallOf(o, connection->size()), format, config.executor);
@@ -54,7 +55,7 @@ public:
         try {
             fb_ = std::make_unique<FrameBuffer>(connection, config, pixelOp);
         } catch (const dfb::InvalidArgument&) {
-            wall_.reset(); // in order, before the exception passes: all ranks throw it
+            wall_.reset(); // destroyed before the exception leaves, in order; all ranks throw it
             throw;
         }
     }

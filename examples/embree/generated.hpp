@@ -10,8 +10,8 @@ namespace detail {
 
 constexpr double pi = 3.14159265358979323846;
 
-// A scalar field on a grid of any size: sums of products of waves along the axes, of which only one table per axis
-// is kept. A function of the voxel's index in the whole volume, so that bricks agree on ghosts without talking.
+// A scalar field on a grid of any size: sums of products of waves along the axes, of which only one table per axis is
+// kept. It depends only on a voxel's index in the whole volume, so bricks agree on ghosts without communication.
 class WaveField {
 public:
     WaveField(const Index3& dims, std::uint64_t seed)

@@ -7,7 +7,8 @@
 
 namespace example {
 
-// file.h5:/path/to/dataset -> its two parts; the second is "/" if it is left out, and empty if it is no HDF5 file.
+// Splits file.h5:/path/to/dataset into its two parts. The second is "/" if it is left out, and empty if the file is no
+// HDF5 file.
 inline std::pair<std::string, std::string> splitHdf5Path(const std::string& path)
 {
     const std::string endings[] = {".h5", ".hdf5"};

@@ -20,14 +20,14 @@ namespace example {
 
 namespace detail {
 
-// The library is not thread-safe as Debian builds it, and ranks may be threads.
+// HDF5 as Debian builds it is not thread-safe, and ranks may be threads.
 inline std::mutex& hdf5Mutex()
 {
     static std::mutex mutex;
     return mutex;
 }
 
-// An object of the library. All members are to be called with the mutex held.
+// An object of the HDF5 library. Its members must be called with the mutex held.
 class Hdf5Object {
 public:
     Hdf5Object() = default;
@@ -89,7 +89,7 @@ public:
             start[axes_[axis]] = static_cast<hsize_t>(lo[axis]);
             size[axes_[axis]] = static_cast<hsize_t>(count[axis]);
         }
-        // Of the same shape, or the library goes from voxel to voxel where there are chunks.
+        // Both have the same shape; otherwise the library copies chunked data voxel by voxel.
         const Hdf5Object in(H5Scopy(space_.id()), H5Sclose),
             memory(H5Screate_simple(static_cast<int>(size.size()), size.data(), nullptr), H5Sclose);
         const hid_t type = type_ == VoxelType::UInt8    ? H5T_NATIVE_UINT8
@@ -106,13 +106,13 @@ private:
 
     void open()
     {
-        H5Eset_auto2(H5E_DEFAULT, nullptr, nullptr); // it would print what is thrown here
+        H5Eset_auto2(H5E_DEFAULT, nullptr, nullptr); // otherwise the library prints the errors that are thrown here
         const auto [file, name] = splitHdf5Path(path_);
         file_ = Hdf5Object(H5Fopen(file.c_str(), H5F_ACC_RDONLY, H5P_DEFAULT), H5Fclose);
         if (!file_.isThere())
             fail("cannot be opened as an HDF5 file");
         const Hdf5Object access(H5Pcreate(H5P_DATASET_ACCESS), H5Pclose);
-        // Chunks of a layer or so, as slabs of some layers are read one after the other.
+        // Room for the chunks of about one layer, because slabs of some layers are read one after the other.
         H5Pset_chunk_cache(access.id(), 12421, std::size_t{64} << 20, 1.0);
         data_ = Hdf5Object(H5Dopen2(file_.id(), name.c_str(), access.id()), H5Dclose);
         if (!data_.isThere())
@@ -128,7 +128,7 @@ private:
         file_ = Hdf5Object();
     }
 
-    // The first of the data sets in the file.
+    // The names of the first data sets in the file, as a text.
     std::string list() const
     {
         std::vector<std::string> names;
@@ -188,7 +188,7 @@ private:
     std::string path_;
     Hdf5Object file_, data_, space_;
     std::vector<hsize_t> extent_;
-    std::array<std::size_t, 3> axes_{}; // of x, y and z
+    std::array<std::size_t, 3> axes_{}; // axes of the data set that are x, y and z
     Index3 dims_{};
     VoxelType type_ = VoxelType::Float32;
     bool isFloat_ = false;
@@ -197,7 +197,7 @@ private:
 
 } // namespace detail
 
-// Collective, as openVolume().
+// Collective, like openVolume().
 inline VolumeSource openHdf5(const std::string& path, const Loaders& loaders = {}, const VoxelGrid& grid = {},
                              const LookOf& lookOf = {})
 {
@@ -217,7 +217,7 @@ inline VolumeSource openHdf5(const std::string& path, const Loaders& loaders = {
         std::vector<std::byte> rows;
         const auto [first, end] =
             loaders.shareOf(static_cast<std::uint64_t>(info.dims[1]) * static_cast<std::uint64_t>(info.dims[2]));
-        for (std::uint64_t row = first; row < end;) { // those of a layer, or a part of them
+        for (std::uint64_t row = first; row < end;) { // each time rows of one layer, or some of them
             const int y = static_cast<int>(row % static_cast<std::uint64_t>(info.dims[1])),
                       z = static_cast<int>(row / static_cast<std::uint64_t>(info.dims[1])),
                       count = static_cast<int>(std::min<std::uint64_t>(

@@ -1,4 +1,4 @@
-// HeaderLines: the lines of text that a volume's file begins with, and what a reader wants of one.
+// HeaderLines: the lines of text at the beginning of a volume's file, and the values in a line.
 #pragma once
 
 #include "volume_file.hpp"
@@ -7,7 +7,7 @@
 
 namespace example {
 
-// Reads a stream line by line. What it throws is std::runtime_error that begins with the file and the line.
+// Reads a stream line by line. Throws std::runtime_error whose text begins with the file and the line.
 class HeaderLines {
 public:
     HeaderLines(std::istream& stream, const std::string& path) : stream_(stream), path_(path)
@@ -36,7 +36,7 @@ public:
         return true;
     }
 
-    std::int64_t position() const { return position_; } // behind the last line, in bytes
+    std::int64_t position() const { return position_; } // the byte behind the last line
 
     [[noreturn]] void fail(const std::string& why) const
     {
@@ -84,7 +84,7 @@ public:
     }
     static std::string shortened(std::string_view text) { return std::string(text.substr(0, 60)); }
 
-    // `names`: of each type, with | around them.
+    // `names`: for each type its names, with | around each of them.
     FileType typeOf(const std::string& value, const std::vector<std::pair<std::string, FileType>>& names,
                     const char* expected) const
     {
@@ -105,7 +105,7 @@ public:
                + ": its axes are turned or mirrored in space; it is drawn as it is stored, with x to the right, y down "
                  "and z to the back";
     }
-    // Of one data file. A path in a header is one beside it.
+    // The path of the only data file. A relative path in a header begins in the header's folder.
     std::string pathOfData(const std::string& name, const char* what) const
     {
         if (name.empty() || name.compare(0, 4, "LIST") == 0 || name.find('%') != std::string::npos)

@@ -59,7 +59,7 @@ public:
     }
 
 private:
-    // A renderer throws it when nobody wants the frame any more. Ranks know the error by its text.
+    // A renderer throws it when the viewers no longer want the frame. The ranks recognise the error by its text.
     struct Superseded : std::runtime_error {
         static constexpr const char* text = "the viewers want another picture";
         Superseded() : std::runtime_error(text) {}
@@ -77,7 +77,7 @@ private:
     void load()
     {
         const Loaders loaders = loadersOf(fb_);
-        Options fromAllSides = o_; // bricks are cut for a camera that goes around
+        Options fromAllSides = o_; // so bricks are cut for a camera that goes around
         fromAllSides.frames = 36;
         scene_ = std::make_unique<RankScene>(loadRankScene(fromAllSides, loaders));
         o_.view = withoutEye(scene_->info.focus, scene_->view);
@@ -115,7 +115,7 @@ private:
         LiveWishes home;
         home.camera.azimuth = static_cast<double>(o_.view.azimuth);
         home.camera.elevation = static_cast<double>(o_.view.elevation);
-        if (o_.view.distance) // as near and as far as viewers can go; 0 would show all of the scene
+        if (o_.view.distance) // limits of the viewers; 0 would show all of the scene
             home.camera.distance = std::clamp(static_cast<double>(*o_.view.distance), 1e-4, 1000.0);
         home.camera.target = list(o_.view.target.value_or(scene_->info.focus.box.center()));
         home.width = o_.width;
@@ -126,8 +126,8 @@ private:
         std::fflush(stdout);
     }
 
-    // All ranks come to know what the viewers want. Waits for that while there is nothing to do. Returns false if the
-    // job is to end.
+    // Tells all ranks what the viewers want. Waits for a change if there is nothing to render. Returns false if the job
+    // is to end. Collective.
     bool agree()
     {
         LiveWishes mine;
@@ -181,7 +181,7 @@ private:
             return;
         const bool isFirst = !isDrawn_;
         if (isFirst || samples_ == 0) {
-            // A single sample is in the middle of its pixel; several are all over it.
+            // A single sample is in the middle of its pixel; several are spread over it.
             settings_.passes = isFirst ? 1 : 2;
             for (auto& cells : scene_->renderers)
                 for (Renderer& renderer : cells)
@@ -203,14 +203,15 @@ private:
         ++frames_;
         isDrawn_ = true;
         samples_ += !isFirst;
-        // The first of several samples alone is worse than the one in the middle.
+        // The first of several samples is not shown: it looks worse than the sample in the middle, which is shown
+        // already.
         if (fb_.isDisplayRank() && samples_ != 1)
             show(*report);
     }
 
-    // Renders a frame, which fails on all ranks if the viewers want to look elsewhere. The first frame of a look is
-    // shown nevertheless, or nothing would be seen while the camera moves, unless they want a smaller one, which comes
-    // soon.
+    // Renders a frame. It fails on all ranks if the viewers have changed the camera or the size. The first frame of a
+    // view fails only if they want a smaller one, which comes soon; otherwise nothing would be seen while the camera
+    // moves.
     dfb::FrameReport render()
     {
         const FrameCamera camera = frameCamera(scene_->info, settings_, 0);
@@ -265,7 +266,7 @@ private:
         view_->show(fb_.image().rgba8(), fb_.image().width(), fb_.image().height(), report, std::move(picture));
     }
 
-    // Returns the options with which dfb_render makes this picture.
+    // Returns the options with which dfb_render makes the shown picture.
     std::string words(int samples) const
     {
         const View& view = settings_.view;
@@ -281,7 +282,7 @@ private:
         text += " --size " + std::to_string(settings_.width) + 'x' + std::to_string(settings_.height);
         if (samples > 1)
             text += " --spp " + std::to_string(samples);
-        text += " --ao " + std::to_string(settings_.aoRays); // also 0, which is no default for files
+        text += " --ao " + std::to_string(settings_.aoRays); // also 0, which is not the default for files
         return text + " --background " + number(params_.background[0]) + ',' + number(params_.background[1]) + ','
                + number(params_.background[2]);
     }
@@ -299,11 +300,11 @@ private:
     std::optional<dfb::MixedParallelLoop<FrameBuffer, dfb::RoundRobinBricks>> mixedLoop_;
     dfb::ImageParallelLoop<FrameBuffer> imageLoop_{fb_, dfb::WorkDistribution::Owned};
 
-    LiveWishes wishes_; // that all ranks know of
+    LiveWishes wishes_; // those that all ranks know
     bool isBegun_ = false;
-    bool isDrawn_ = false;    // a picture of this look
+    bool isDrawn_ = false;    // there is a picture of this view
     std::vector<int> owners_; // of the tiles of the last frame
-    int samples_ = 0;         // that have been accumulated for it since
+    int samples_ = 0;         // samples accumulated since then
     std::int64_t frames_ = 0;
 };
 

@@ -36,7 +36,8 @@ public:
     int rank() const { return rank_; }
     int size() const { return size_; }
 
-    // A rank's share of `count` things, which go to the ranks in equal runs: [first, second). And this rank's.
+    // A rank's share [first, second) of `count` things, which are dealt out in equal consecutive runs. The second
+    // function returns this rank's share.
     static std::pair<std::uint64_t, std::uint64_t> shareOf(std::uint64_t count, int rank, int size)
     {
         const auto at = [&](int i) {
@@ -51,15 +52,16 @@ public:
     std::uint64_t bytesRead() const { return *bytesRead_; }
     const std::shared_ptr<std::uint64_t>& readCounter() const { return bytesRead_; }
 
-    // Collective: calls `step`, which returns a std::vector<T>, on every rank; returns those of all, by rank. If it
-    // throws on any rank, all throw std::runtime_error with the text of the lowest of those.
+    // Collective: calls `step`, which returns a std::vector<T>, on every rank. Returns the results of all ranks, one
+    // after the other. If it throws on any rank, all ranks throw std::runtime_error with the text of the lowest such
+    // rank.
     template <class T, class Step>
     std::vector<T> gatherOf(const Step& step) const
     {
         static_assert(std::is_trivially_copyable_v<T>);
         if (size_ == 1)
             return step();
-        Bytes own(1); // 1: what follows is an error
+        Bytes own(1); // a first byte of 1: an error's text follows
         const auto add = [&own](const void* data, std::size_t size) {
             const auto* first = static_cast<const std::byte*>(data);
             own.insert(own.end(), first, first + size);
@@ -87,14 +89,14 @@ public:
         return all;
     }
 
-    // Collective: whether `step` returns true on all ranks. On one where it throws it does not.
+    // Collective: whether `step` returns true on all ranks. An exception counts as false.
     template <class Step>
     bool isOnAll(const Step& step) const
     {
         bool isSo = false;
         try {
             isSo = step();
-        } catch (const std::exception&) { // what is wrong is said by who tries another way
+        } catch (const std::exception&) { // the caller tries another way, which reports the error
         }
         for (const char other : gatherOf<char>([&] { return std::vector<char>{isSo ? '\1' : '\0'}; }))
             isSo = isSo && other != '\0';
@@ -104,8 +106,8 @@ public:
     // Collective.
     std::vector<std::int64_t> sumOf(const std::vector<std::int64_t>& own) const { return size_ == 1 ? own : sum_(own); }
 
-    // Collective: this rank's number of things, which the ranks have in runs, in their order. Returns where the run of
-    // each begins, and the end.
+    // Collective: `count` is this rank's number of things. The things of all ranks follow one another, by rank. Returns
+    // where those of each rank begin, and the end.
     std::vector<std::uint64_t> beginsOf(std::uint64_t count) const
     {
         std::vector<std::uint64_t> begins{0};
@@ -114,14 +116,14 @@ public:
         return begins;
     }
 
-    // Collective: `parts` has one for each rank and, behind these, one for all. Returns what each rank has sent to this
-    // one, by rank: its part and then that for all. They travel in rounds, of which a rank keeps what is for it, and
-    // parts that are through are gone. What a rank has for itself stays where it is.
+    // Collective: `parts` has one part for each rank and, last, one for all ranks. Returns what each rank has sent to
+    // this one, by rank: first the part for this rank, then that for all. The ranks gather the parts in rounds; each
+    // keeps what is for it, and frees a part when all of it is sent. What a rank has for itself is not sent.
     std::vector<Bytes> exchange(std::vector<Bytes> parts) const
     {
         const std::size_t ranks = static_cast<std::size_t>(size_), own = static_cast<std::size_t>(rank_);
         std::vector<Bytes> received(ranks);
-        // The parts of all ranks, which of each are one stream.
+        // The sizes of the parts of all ranks. The parts of one rank form a stream.
         const std::vector<std::uint64_t> sizes = gatherOf<std::uint64_t>([&] {
             received[own] = std::exchange(parts[own], Bytes());
             received[own].insert(received[own].end(), parts.back().begin(), parts.back().end());
@@ -133,7 +135,7 @@ public:
         if (size_ == 1)
             return received;
         std::uint64_t longest = 0;
-        gatherOf<char>([&] { // nobody waits for a rank without memory
+        gatherOf<char>([&] { // if a rank has too little memory, all throw
             for (std::size_t source = 0; source < ranks; ++source) {
                 const auto first = sizes.begin() + static_cast<std::ptrdiff_t>(source * (ranks + 1));
                 longest = std::max(longest, std::accumulate(first, first + size_ + 1, std::uint64_t{0}));
@@ -142,7 +144,7 @@ public:
             }
             return std::vector<char>();
         });
-        // Calls f(part, from, to) for the bytes of parts of `source` that are [begin, end) of its stream.
+        // Calls f(part, from, to) for the pieces of parts of `source` that lie in bytes [begin, end) of its stream.
         const auto forParts = [&](std::size_t source, std::uint64_t begin, std::uint64_t end, const auto& f) {
             std::uint64_t first = 0;
             for (std::size_t part = 0; part <= ranks; ++part) {
@@ -174,7 +176,7 @@ public:
         return received;
     }
 
-    // Collective: the lines of rank 0, which have no line ends, on all ranks.
+    // Collective: returns the lines of rank 0 on all ranks. The lines have no line ends.
     std::vector<std::string> linesOfFirst(const std::vector<std::string>& lines) const
     {
         const std::vector<char> text = gatherOf<char>([&] {
@@ -193,7 +195,7 @@ public:
         return all;
     }
 
-    // Adds an array to some bytes, or takes it from them and adds it to `array`.
+    // pack() appends an array to some bytes; unpack() takes it from them and appends it to `array`.
     template <class T>
     static void pack(const std::vector<T>& array, Bytes& bytes)
     {

@@ -1,4 +1,4 @@
-// LookOptions: the options of the camera's place and of how files are shown.
+// LookOptions: the options for the camera's place and for the look of files.
 #pragma once
 
 #include "camera.hpp"
@@ -52,7 +52,7 @@ public:
             look);
     }
 
-    // To be called when the command line is parsed. Throws CLI::ValidationError.
+    // Call it after the command line has been parsed. Throws CLI::ValidationError.
     void apply(View& view, FileLook& look) const
     {
         const auto point = [](const char* name, const std::string& text) {
@@ -118,7 +118,7 @@ private:
     std::string eye_, target_, up_, transfer_, range_, isovalue_, clip_;
 };
 
-// Fills the look of a file, where it says nothing itself, from that of the run.
+// Completes the look of a file: what it leaves open comes from the look of the run.
 inline FileLook merged(FileLook own, const FileLook& run)
 {
     if (!own.clip)

@@ -23,7 +23,7 @@
 namespace example {
 namespace {
 
-// Lets oneTBB have `threads` workers in this process also where there are fewer cores.
+// Lets oneTBB have `threads` workers in this process, even if there are fewer cores.
 class WorkerLimit {
 public:
 #if defined(DFB_HAS_TBB)

@@ -40,8 +40,8 @@ inline std::string readFile(const std::string& path)
 
 namespace detail {
 
-// Fans a polygon; throws on an index that is none of so many vertices. `where` gives the beginning of the error, as
-// below.
+// Adds a polygon as a fan of triangles. Throws if an index is not from 0 to vertexCount - 1. `where()` returns the
+// beginning of the error's text, also below.
 template <class Where>
 void addPolygon(Mesh& mesh, const std::vector<std::int64_t>& polygon, std::uint64_t vertexCount, const Where& where)
 {
@@ -65,7 +65,7 @@ void addVertex(Mesh& mesh, const Vec3& p, const Where& where)
     mesh.positions.push_back(p);
 }
 
-// From sRGB, each channel in [0, 1].
+// Converts a colour from sRGB, each channel in [0, 1].
 inline Vec3 linearOf(const Vec3& srgb)
 {
     const auto linear = [](float v) { return v <= 0.04045f ? v / 12.92f : std::pow((v + 0.055f) / 1.055f, 2.4f); };
@@ -74,8 +74,8 @@ inline Vec3 linearOf(const Vec3& srgb)
 
 inline bool isColor(const Vec3& c) { return c.x >= 0 && c.y >= 0 && c.z >= 0 && c.x <= 1 && c.y <= 1 && c.z <= 1; }
 
-// Of the colours of vertices as they are in a file, in sRGB, makes those of a mesh. Where some are missing or are no
-// colours, all are left out.
+// Converts the vertex colours of a mesh from sRGB, as they are in a file. If some are missing or are no colours, all
+// are left out.
 inline void finishColors(Mesh& mesh, const std::string& name, Notes* notes)
 {
     if (mesh.colors.empty())
@@ -92,7 +92,7 @@ inline void finishColors(Mesh& mesh, const std::string& name, Notes* notes)
 
 } // namespace detail
 
-// As long as twice the triangle's area.
+// The normal of a triangle; its length is twice the area.
 inline Vec3d weightedNormal(const Mesh& mesh, const Triangle& t)
 {
     const Vec3d a = toDouble(mesh.positions[t[0]]), b = toDouble(mesh.positions[t[1]]),
@@ -100,7 +100,7 @@ inline Vec3d weightedNormal(const Mesh& mesh, const Triangle& t)
     return cross(b - a, c - a);
 }
 
-// Unit vertex normals, the mean of the triangles around weighted by their area; zero where there are none.
+// Unit vertex normals: the mean normal of the triangles around a vertex, weighted by area; zero if there are none.
 inline std::vector<Vec3> vertexNormals(const Mesh& mesh)
 {
     std::vector<Vec3d> sums(mesh.positions.size());

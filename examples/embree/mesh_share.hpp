@@ -1,7 +1,7 @@
 // MeshShare: a rank's part of a mesh that several ranks have read together, as it is read: a run of the vertices and a
 // run of the triangles, whose vertices other ranks may have.
 //
-// MeshPart: the same triangles with all that they need: their vertices, and normals as of the whole mesh.
+// MeshPart: the same triangles with all vertices that they need. normalsOf() gives their normals in the whole mesh.
 #pragma once
 
 #include "loaders.hpp"
@@ -18,7 +18,7 @@
 namespace example {
 
 struct MeshShare {
-    Mesh mesh;                               // triangles have the numbers that vertices have in the whole mesh
+    Mesh mesh;                               // triangles have vertex numbers of the whole mesh
     std::vector<std::uint64_t> vertexBegins; // where the vertices of each rank begin in the whole mesh, and the end
     std::uint64_t firstTriangle = 0;         // its number in the whole mesh
 };
@@ -29,7 +29,7 @@ struct MeshPart {
     std::uint32_t firstTriangle = 0;
 };
 
-// Collective: shares of the mesh that rank 0 has; those of others are not looked at.
+// Collective: deals out the mesh of rank 0 in shares. What the other ranks give is ignored.
 inline MeshShare dealMesh(Mesh whole, const Loaders& loaders)
 {
     const int ranks = loaders.size();
@@ -69,7 +69,7 @@ inline MeshShare dealMesh(Mesh whole, const Loaders& loaders)
     return share;
 }
 
-// The vertices that some triangles have: a bit for each of a range.
+// The set of vertices that some triangles have, with a bit for each vertex of a range.
 class VertexSet {
 public:
     explicit VertexSet(const std::vector<Triangle>& triangles)
@@ -94,7 +94,7 @@ public:
         }
     }
 
-    // How many of them are before one.
+    // How many vertices of the set are before this one.
     std::uint32_t indexOf(std::uint32_t vertex) const
     {
         const std::size_t word = (vertex - first_) / 64;
@@ -122,7 +122,7 @@ private:
     std::vector<std::uint32_t> before_; // how many are before each word
 };
 
-// Asks the ranks that have vertices for what they have of them, as often as one likes. Collective, all of it.
+// Asks the ranks that have certain vertices for their values, as often as needed. All members are collective.
 class VertexLookup {
 public:
     // `wanted`: ascending. `begins`: as MeshShare has them.
@@ -158,7 +158,7 @@ public:
             Loaders::pack(answer, parts[r]);
         }
         std::vector<T> all;
-        for (const Loaders::Bytes& bytes : loaders_.exchange(std::move(parts))) { // by rank, and so ascending
+        for (const Loaders::Bytes& bytes : loaders_.exchange(std::move(parts))) { // by rank, so vertices ascend
             const std::byte* at = bytes.data();
             Loaders::unpack(at, all);
         }
@@ -168,7 +168,7 @@ public:
 private:
     const std::vector<std::uint64_t>& begins_;
     const Loaders& loaders_;
-    std::vector<std::vector<std::uint32_t>> asked_; // of this rank, by each
+    std::vector<std::vector<std::uint32_t>> asked_; // the vertices that each rank asks this one for
 };
 
 // The triangles of a share with their vertices. Collective.
@@ -186,8 +186,8 @@ inline MeshPart partOf(MeshShare& share, const VertexLookup& lookup, const Verte
     return part;
 }
 
-// Collective: what vertexNormals() of the whole mesh has for the vertices of each part, to the bit: the rank that has a
-// vertex adds its triangles in their order.
+// Collective: the normals that vertexNormals() of the whole mesh has for the vertices of a part. They are equal bit for
+// bit, because the rank that has a vertex adds its triangles in their order.
 inline std::vector<Vec3> normalsOf(const MeshPart& part, const std::vector<std::uint64_t>& begins,
                                    const VertexLookup& lookup, const Loaders& loaders)
 {
@@ -207,7 +207,7 @@ inline std::vector<Vec3> normalsOf(const MeshPart& part, const std::vector<std::
     forEachCorner([&](std::uint32_t vertex, const Vec3d& normal) {
         if (vertex >= begins[rank] && vertex < begins[rank + 1])
             return;
-        const auto behind = std::upper_bound(begins.begin(), begins.end(), vertex); // also where a rank has none
+        const auto behind = std::upper_bound(begins.begin(), begins.end(), vertex); // right also where a rank has none
         ForOne& other = forOthers[static_cast<std::size_t>(behind - begins.begin()) - 1];
         other.vertices.push_back(vertex);
         other.normals.push_back(normal);
@@ -244,9 +244,9 @@ inline std::vector<Vec3> normalsOf(const MeshPart& part, const std::vector<std::
     return lookup.of(normals);
 }
 
-// Collective: gives each rank as many of some things, in the same order, unless it is about so. Ranks that have read
-// equal parts of a text may have only vertices, or only triangles. `begins`: where those of each rank begin, and the
-// end.
+// Collective: gives all ranks equally many of some things, which keep their order; does nothing if the numbers are
+// about equal. For ranks that have read equal parts of a text, and may have only vertices, or only triangles. `begins`:
+// where the things of each rank begin, and the end.
 template <class T>
 void evenOut(std::vector<T>& things, const std::vector<std::uint64_t>& begins, const Loaders& loaders)
 {
@@ -273,8 +273,8 @@ void evenOut(std::vector<T>& things, const std::vector<std::uint64_t>& begins, c
     }
 }
 
-// Collective: a share whose triangles and colours are as each rank has read them. Nothing, on all ranks, if there are
-// no triangles or too many.
+// Collective: completes a share whose triangles and colours are as each rank has read them. Returns nothing, on all
+// ranks, if there are no triangles or too many.
 inline std::optional<MeshShare> finished(MeshShare share, const std::string& name, const Loaders& loaders, Notes* notes)
 {
     const std::uint64_t most = std::uint64_t{1} << 32;
@@ -287,7 +287,7 @@ inline std::optional<MeshShare> finished(MeshShare share, const std::string& nam
         {static_cast<std::int64_t>(colors.size()), std::count_if(colors.begin(), colors.end(), detail::isColor)});
     const auto all = static_cast<std::int64_t>(share.vertexBegins.back());
     if (sums[0] > 0 && (sums[0] != all || sums[1] != all))
-        colors.assign(1, Vec3{-1, 0, 0}); // no colour: so they are left out on all ranks
+        colors.assign(1, Vec3{-1, 0, 0}); // not a colour, so all ranks leave colours out
     detail::finishColors(share.mesh, name, notes);
     if (sums[0] == all && sums[1] == all)
         evenOut(colors, share.vertexBegins, loaders);

@@ -92,7 +92,7 @@ private:
     void readSpacing(const std::string& key, const std::string& value)
     {
         file_.spacing = lines_.spacing(lines_.numbers<double, 3>(value, key));
-        hasSpacing_ = key == "ElementSpacing"; // the voxel's size stands in where there is none
+        hasSpacing_ = key == "ElementSpacing"; // without it, the voxel's size is used
     }
     void readMatrix(const std::string& key, const std::string& value)
     {
@@ -131,7 +131,7 @@ private:
 } // namespace detail
 
 // The header of a MetaImage, whose voxels are raw and either in the same file or in another one. Throws
-// std::runtime_error with `path` and, where one is wrong, the line.
+// std::runtime_error with `path` and, if a line is wrong, that line.
 inline VolumeFile parseMetaImage(std::istream& stream, const std::string& path)
 {
     return detail::MetaImageReader(stream, path).read();

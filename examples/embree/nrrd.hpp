@@ -1,6 +1,6 @@
 // NRRD: the reader of headers of .nrrd and .nhdr files (teem.sourceforge.net/nrrd/format.html).
 //
-// It is our own: teem, which has one, reads the file as a whole, where each rank wants its part.
+// It is our own, because the reader of teem reads the whole file, and each rank needs only its part.
 #pragma once
 
 #include "header_lines.hpp"
@@ -29,7 +29,7 @@ public:
                 break;
             const std::size_t colon = line.find(": ");
             if (line[0] == '#' || line.find(":=") < colon)
-                continue; // a comment; a key and a value, which say nothing of the voxels
+                continue; // a comment, or a key and value, which do not describe the voxels
             if (colon == std::string::npos && (line.empty() || line.back() != ':'))
                 lines_.fail("expected 'field: value', got '" + lines_.shortened(line) + "'");
             readField(lowerCase(line.substr(0, std::min(colon, line.size() - 1))),
@@ -109,7 +109,7 @@ private:
     {
         auto spacings = lines_.numbers<double, 3>(value, "spacings");
         for (double& spacing : spacings)
-            spacing = std::isnan(spacing) ? 1 : spacing; // so says who does not know it
+            spacing = std::isnan(spacing) ? 1 : spacing; // NaN stands for an unknown spacing
         file_.spacing = lines_.spacing(spacings);
     }
     void readDirections(const std::string& value)
@@ -127,7 +127,7 @@ private:
             file_.notes.push_back(lines_.turnedNote());
     }
 
-    // As in (1,0,0) (0,1,0) (0,0,1).
+    // Vectors as in (1,0,0) (0,1,0) (0,0,1).
     template <std::size_t count>
     std::array<std::array<double, 3>, count> vectors(std::string_view text, const std::string& what) const
     {
@@ -170,7 +170,7 @@ private:
         skipLines();
         file_.begin = byteSkip_ < 0 ? -1 : file_.begin + byteSkip_;
     }
-    // In the file that has the voxels, from where they would be.
+    // Skips lines in the file that has the voxels, from where they would begin.
     void skipLines()
     {
         if (lineSkip_ == 0 || byteSkip_ < 0)
@@ -202,7 +202,7 @@ private:
 } // namespace detail
 
 // The header of an NRRD file, whose voxels are raw and either in the same file or in another one. Throws
-// std::runtime_error with `path` and, where one is wrong, the line.
+// std::runtime_error with `path` and, if a line is wrong, that line.
 inline VolumeFile parseNrrd(std::istream& stream, const std::string& path)
 {
     return detail::NrrdReader(stream, path).read();

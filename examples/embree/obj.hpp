@@ -1,7 +1,7 @@
 // OBJ: the reader that makes a mesh from an OBJ file.
 //
-// It is our own: tinyobjloader 2.0 takes what is no number, or is not there, for 0, cuts indices to 32 bits, and tells
-// neither lines nor the colours of vertices to who wants to check them.
+// It is our own: tinyobjloader 2.0 reads wrong and missing numbers as 0, cuts indices to 32 bits, and gives its caller
+// neither the lines nor the vertex colours to check.
 #pragma once
 
 #include "file_share.hpp"
@@ -14,7 +14,7 @@ namespace example {
 
 namespace detail {
 
-// Some lines of a file, before which there are so many vertices. Colours are as they are in the file.
+// Parses some lines of a file, before which there are `verticesBefore` vertices. Colours stay as in the file.
 inline Mesh parseObjLines(std::string_view bytes, const std::string& name, std::uint64_t verticesBefore)
 {
     Mesh mesh;
@@ -73,8 +73,9 @@ inline std::uint64_t countObjVertices(std::string_view bytes)
 
 } // namespace detail
 
-// The lines v, with or without a colour, and f; all else is skipped, polygons become fans. Throws std::runtime_error
-// with `name`, the line, what was expected and what was found. `notes` gets what was left out, if not null.
+// Reads the lines v, with or without a colour, and f. All others are skipped; polygons become fans of triangles. Throws
+// std::runtime_error with `name`, the line, what was expected and what was found. `notes` gets what was left out, if
+// not null.
 inline Mesh parseObj(std::string_view bytes, const std::string& name, Notes* notes = nullptr)
 {
     Mesh mesh = detail::parseObjLines(bytes, name, 0);
@@ -85,8 +86,8 @@ inline Mesh parseObj(std::string_view bytes, const std::string& name, Notes* not
     return mesh;
 }
 
-// Collective: the same, of which each rank reads a share of the lines. Nothing, on all ranks, if anything is not as it
-// should be: parseObj() of the whole says what.
+// Collective: the same, but each rank reads a share of the lines. Returns nothing, on all ranks, if anything is wrong;
+// parseObj() of the whole file then says what.
 inline std::optional<MeshShare> readObjShare(const std::string& path, const Loaders& loaders, Notes* notes)
 {
     std::string bytes;

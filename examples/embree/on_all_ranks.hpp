@@ -1,4 +1,4 @@
-// onAllRanks(): a step of all ranks, which they go on from together.
+// onAllRanks(): a step of all ranks, after which they know whether it has succeeded on all.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -9,8 +9,8 @@
 
 namespace example {
 
-// Runs `step` on every rank. If it throws on any, the lowest of those says why, and all return false. `fb`: a
-// framebuffer, of which no frame is open.
+// Runs `step` on every rank. If it throws on any, the lowest such rank prints why, and all return false. `fb`: a
+// framebuffer that has no open frame. Collective.
 template <class FrameBuffer, class Step>
 bool onAllRanks(FrameBuffer& fb, const Step& step)
 {

@@ -19,7 +19,7 @@
 namespace example {
 namespace detail {
 
-// An empty string if the path ends in one of `endings`, else what is wrong with it: the form CLI11 wants.
+// Returns an empty string if the path ends in one of `endings`, otherwise what is wrong with it, as CLI11 wants it.
 inline std::string checkEnding(const std::string& path, const std::vector<std::string>& endings)
 {
     std::string all;
@@ -104,7 +104,7 @@ inline void parseSize(const std::string& name, const std::string& text, int most
                                              + std::to_string(most));
 }
 
-// Three numbers within [lo, hi], as in R,G,B; `what` says so.
+// Three numbers within [lo, hi], as in R,G,B; `what` describes them in the error.
 inline std::array<float, 3> parseThree(const std::string& name, const std::string& text, double lo, double hi,
                                        const std::string& what)
 {
@@ -121,7 +121,7 @@ inline std::array<float, 3> parseThree(const std::string& name, const std::strin
     return values;
 }
 
-// The channels that an .exr has beside colour, by the words of --layers.
+// The channels that an .exr has besides colour, from the words of --layers.
 inline dfb::ChannelMask parseLayers(const std::string& name, const std::string& text)
 {
     static const std::vector<std::pair<std::string, dfb::ChannelMask>> layers = {

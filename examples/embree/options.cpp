@@ -24,7 +24,8 @@ namespace example {
 
 namespace {
 
-// The arguments in the order that CLI11 takes, from the last on. --live gets its port: what follows it may be a scene.
+// The arguments in the order that CLI11 takes: the last one first. A --live without a number gets the port -1, because
+// CLI11 would take a scene that follows for the port.
 std::vector<std::string> withPort(int argc, const char* const* argv)
 {
     std::vector<std::string> words;
@@ -99,7 +100,7 @@ public:
     }
 
 private:
-    static constexpr int most = 1 << 20; // of what has no limit of its own
+    static constexpr int most = 1 << 20; // for options that have no limit of their own
 
     // ---- adding an option to the group
 
@@ -113,7 +114,7 @@ private:
         app_.add_option(name, value, what)->option_text(form)->group(group_);
     }
     void flag(const char* name, bool& value, const char* what) { app_.add_flag(name, value, what)->group(group_); }
-    // Its value is one of some words, which becomes the enumerator of that place.
+    // Its value is one of some words; word number i becomes enumerator number i.
     template <class Enum>
     void words(const char* name, Enum& value, const std::vector<std::string>& all, const char* what)
     {
@@ -138,7 +139,7 @@ private:
                         "a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1. They are color, opacity, scale, rotate, "
                         "translate, and, as the options of the same name, clip, transfer, range and isovalue")
             ->option_text("SCENE...");
-        app_.option_defaults()->take_last(); // of an option that is given twice the last counts
+        app_.option_defaults()->take_last(); // if an option is given twice, the last one counts
     }
 
     void addFileOptions()
@@ -426,7 +427,7 @@ private:
         }
     }
 
-    // All options as they count, for the record; without those that have no value. Or those that were given.
+    // The names and effective values of all options, or of those that were given. Options without a value are left out.
     std::vector<std::pair<std::string, std::string>> values(bool areGiven) const
     {
         std::vector<std::pair<std::string, std::string>> all;
@@ -446,7 +447,7 @@ private:
     }
 
     CLI::App app_{"Renders volumes, meshes and spheres over several ranks into one image.\n", "dfb_render"};
-    const char* group_ = "Options"; // of what is added
+    const char* group_ = "Options"; // of the options that are added
     std::map<const CLI::Option*, std::vector<std::string>> wordsOf_;
     Options options_;
     std::optional<LookOptions> looks_;

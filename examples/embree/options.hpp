@@ -43,7 +43,7 @@ struct OutputFiles {
 
 struct Options : OutputFiles, RenderSettings {
     std::vector<std::string> scene; // `synthetic`, `demo`, or files, as the user wrote them
-    std::vector<SceneFile> files;   // of these, with what holds of each
+    std::vector<SceneFile> files;   // the files among these, each with its look
     bool fit = true;
     int xyzFrame = 0;                                    // of .xyz files; 0: the first
     std::optional<std::array<float, 3>> spacing, origin; // of volumes; none: as the file says
@@ -56,7 +56,7 @@ struct Options : OutputFiles, RenderSettings {
     Balance balance = Balance::Cost;
     Distribution distribution = Distribution::Owned; // in image mode
     int interleave = 1;                              // cells of a brick
-    int deep = 0;                                    // segments per pixel and brick; 0: a fragment of one
+    int deep = 0;                                    // segments per pixel and brick; 0: one fragment
     dfb::WireFormat wire = dfb::WireFormat::Float32;
     double errorBudget = 0;     // 0: `wire`
     float minTransmittance = 0; // 0: off
@@ -69,7 +69,7 @@ struct Options : OutputFiles, RenderSettings {
     OwnerMap ownerMap = OwnerMap::Auto;
 
     float adaptive = 0;                             // 0: off
-    FileLook look;                                  // of files that do not say themselves
+    FileLook look;                                  // for files that have none of their own
     float exposure = 0;                             // 0: off
     std::optional<std::array<float, 3>> background; // linear RGB, opaque; none: transparent black
     bool dither = false;
@@ -79,12 +79,13 @@ struct Options : OutputFiles, RenderSettings {
     int wallColumns = 0, wallRows = 0; // 0: no wall
     int bezel = 0;
 
-    // All options but the scene as they count, by name and as words of the command line; without those that are empty.
+    // The effective values of all options except the scene, by name and as words of the command line. Empty ones are
+    // left out.
     std::vector<std::pair<std::string, std::string>> values;
     std::vector<std::pair<std::string, std::string>> given; // those of them that the user gave
 };
 
-// Exit codes beside 0.
+// Exit codes besides 0.
 inline constexpr int exitFailed = 1; // the run has failed
 inline constexpr int exitUsage = 2;  // the command line is wrong
 
@@ -96,7 +97,7 @@ struct ParsedOptions {
     std::string message;
 };
 
-// Prints nothing, so that of many ranks one can do it.
+// Prints nothing, so that one of many ranks can do it.
 ParsedOptions parseOptions(int argc, const char* const* argv);
 
 // Returns the text of a file with which --config repeats this run.

@@ -24,8 +24,8 @@ namespace example {
 
 namespace {
 
-// The rows of an image as a PFM: from the lowest to the highest, little-endian. `planes` floats of each pixel,
-// `stride` floats apart.
+// Writes an image as a PFM: rows from the lowest to the highest, little-endian. Each pixel has `planes` floats; pixels
+// are `stride` floats apart.
 void writeFloats(const std::string& path, int width, int height, const float* values, int stride, int planes)
 {
     errno = 0;
@@ -47,8 +47,8 @@ void writeFloats(const std::string& path, int width, int height, const float* va
         detail::failToWrite(path, std::strerror(errno));
 }
 
-// Rows of 16-bit sRGB; `fillRow(y)` puts each into `row`. Returns false if libpng fails, which it tells by longjmp: so
-// nothing here has a destructor.
+// Writes rows of 16-bit sRGB; `fillRow(y)` puts each into `row`. Returns false if libpng fails. It reports that by
+// longjmp, so nothing here may have a destructor.
 template <class FillRow>
 bool writePngRows(std::FILE* file, int width, int height, bool hasAlpha, const std::uint8_t* row,
                   const FillRow& fillRow)
@@ -177,7 +177,7 @@ void writePng(const std::string& path, int width, int height, const std::uint8_t
     image.width = static_cast<png_uint_32>(width);
     image.height = static_cast<png_uint_32>(height);
     image.format = hasAlpha ? PNG_FORMAT_RGBA : PNG_FORMAT_RGB;
-    // Not png_image_write_to_file: when that fails it deletes what was at the path, be it a device.
+    // Not png_image_write_to_file, which deletes the file, or even a device, when it fails.
     errno = 0;
     std::FILE* file = std::fopen(path.c_str(), "wb");
     if (file == nullptr)
@@ -231,7 +231,7 @@ std::vector<std::uint8_t> straightPixels(int width, int height, const float* rgb
             const double alpha = std::min(static_cast<double>(rgba[i + 3]), 1.0);
             for (std::size_t c = i; c < i + 3; ++c)
                 row[c] = alpha > 0 ? static_cast<double>(rgba[c]) / alpha : 0.0;
-            row[i + 3] = 1; // dithering keeps colours below alpha, which is for premultiplied ones
+            row[i + 3] = 1; // because dithering limits colours to alpha, as is right for premultiplied ones
         }
         std::uint8_t* out = pixels.data() + static_cast<std::size_t>(y) * rowSize;
         if (dither)

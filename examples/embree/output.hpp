@@ -20,21 +20,21 @@ namespace detail {
 
 } // namespace detail
 
-// Throws if the file cannot be opened for writing. What it holds stays; if there is none, none is left behind.
+// Throws if the file cannot be opened for writing. Its content stays; if there was no file, none is left behind.
 void requireWritable(const std::string& path);
 
-// An 8-bit PNG of RGBA pixels whose colour is sRGB-encoded, row 0 on top. With `hasAlpha` their alpha is straight, as
-// PNG has it, and is written; else it is left out: premultiplied colour is the image over black.
+// An 8-bit PNG of RGBA pixels whose colour is sRGB-encoded, row 0 on top. With `hasAlpha` the colours must be straight,
+// as PNG has them, and alpha is written. Otherwise alpha is left out: premultiplied colours are the image over black.
 void writePng(const std::string& path, int width, int height, const std::uint8_t* srgba, bool hasAlpha);
 
-// Likewise with 16 bits a channel, from linear premultiplied RGBA: sRGB-encoded, and straight where it has alpha, as
-// straightPixels() says; over black where it has none.
+// The same with 16 bits a channel, from linear premultiplied RGBA. Colours become sRGB: with `hasAlpha` straight, as in
+// straightPixels(), otherwise over black.
 void writePng16(const std::string& path, int width, int height, const float* rgba, bool hasAlpha);
 
 // Pixels of a PNG from linear premultiplied RGBA of an image, row 0 on top: sRGB-encoded colour with straight alpha.
 // Alpha is round(255 * alpha). The colour is that of colour / alpha, divided in double and clamped to 1, at the nearest
 // sRGB level or dithered; it is 0 where alpha is 0 or less, which loses colour that has no alpha. Over black the
-// picture is the premultiplied image again, but for the rounding of both to 8 bits.
+// picture is the premultiplied image again, except for the rounding of both to 8 bits.
 std::vector<std::uint8_t> straightPixels(int width, int height, const float* rgba, bool dither);
 
 // Linear RGB as a colour PFM, from RGBA pixels, row 0 on top.
@@ -54,17 +54,17 @@ std::string hashPixels(const float* rgba, std::size_t pixelCount);
 
 double meanAlpha(const float* rgba, std::size_t pixelCount);
 
-// Where the time of a rank has gone. Times are this rank's own; waiting for slower ranks counts as compositing.
+// How a rank has spent its time. Times are this rank's own; waiting for slower ranks counts as compositing.
 struct Times {
     double loadMs = 0;        // setting up, reading and preparing its part of the scene
-    double renderMs = 0;      // rendering, and compositing of what came in between
+    double renderMs = 0;      // rendering, and compositing of what arrived meanwhile
     double compositingMs = 0; // from the end of its rendering to the finished image
-    double writeMs = 0;       // writing files, but for the statistics
+    double writeMs = 0;       // writing files, except for the statistics
 
     double totalMs() const { return loadMs + renderMs + compositingMs + writeMs; }
 };
 
-// Of a rank in one frame; it loads nothing then.
+// Statistics of a rank in one frame; loadMs is 0.
 struct RankFrameStats {
     Times times;
     // Tiles rendered (of a brick, and of each sample) and work, counted in samples of volumes and rays.
@@ -76,7 +76,7 @@ struct FrameStats {
     dfb::FrameReport report;
 };
 
-// Of a rank in the whole run.
+// Statistics of a rank in the whole run.
 struct RankStats {
     Times times;
     double totalMs = 0; // by the clock, from its start to when all files but the statistics were written
@@ -97,7 +97,7 @@ struct RunStats {
     std::vector<FrameStats> frames;
 };
 
-// The rank that rendered last, and so waited least for others. (No clocks of different ranks are compared.)
+// The rank that finished rendering last, and so waited least for others. (No clocks of different ranks are compared.)
 template <class Rank>
 std::size_t slowestOf(const std::vector<Rank>& ranks)
 {

@@ -54,7 +54,7 @@ public:
             "none");
     }
 
-    // To be called when the command line is parsed. Throws CLI::ValidationError.
+    // Call it after the command line has been parsed. Throws CLI::ValidationError.
     void apply(OutputFiles& files) const
     {
         if (!files.cinema.empty()) {
@@ -96,7 +96,7 @@ public:
 private:
     static constexpr const char* group = "Files to write";
 
-    // `endings`: one of which the text must have; none: any.
+    // The text must end in one of `endings`, if there are any.
     void add(const char* name, std::string& text, const char* form, const std::vector<std::string>& endings,
              const char* what)
     {

@@ -27,9 +27,9 @@ public:
         return lasted;
     }
 
-    // Of a phase, without what has passed since the last enter().
+    // The time in a phase, in ms, without what has passed since the last enter().
     double ms(Phase phase) const { return ms_[static_cast<std::size_t>(phase)]; }
-    // By the clock, from the beginning to now.
+    // The time from the beginning to now, in ms.
     double totalMs() const { return Milliseconds(Clock::now() - begin_).count(); }
 
 private:

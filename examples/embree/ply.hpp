@@ -18,7 +18,7 @@ namespace detail {
 
 enum class PlyType { Int8, UInt8, Int16, UInt16, Int32, UInt32, Float32, Float64 };
 
-// In a binary file.
+// The bytes of a value in a binary file.
 inline std::size_t plyBytes(PlyType type)
 {
     static const std::array<std::size_t, 8> sizes{1, 1, 2, 2, 4, 4, 4, 8};
@@ -30,7 +30,7 @@ struct PlyProperty {
     PlyType type = PlyType::Float32;
     bool isList = false;
     PlyType countType = PlyType::UInt8;
-    int channel = -1; // 0, 1 or 2: it is red, green or blue
+    int channel = -1; // 0, 1 or 2: red, green or blue
 };
 
 struct PlyElement {
@@ -72,7 +72,7 @@ public:
         return mesh;
     }
 
-    // ---- for who reads rows of several ranges: the header, then some rows at a time
+    // ---- for reading several ranges of rows: the header, then some rows at a time
 
     void readHeader()
     {
@@ -290,10 +290,10 @@ private:
         fail("unknown type '" + word + "'");
     }
 
-    // Which value of a channel is all of it.
+    // The value of a channel at full intensity.
     static double largestOf(PlyType type)
     {
-        static const std::array<double, 8> all{127, 255, 32767, 65535, 255, 255, 1, 1}; // wide integers as of bytes
+        static const std::array<double, 8> all{127, 255, 32767, 65535, 255, 255, 1, 1}; // 32-bit integers: as bytes
         return all[static_cast<std::size_t>(type)];
     }
 
@@ -309,10 +309,10 @@ private:
 
 } // namespace detail
 
-// ASCII or binary of either byte order. The colours of vertices (red, green, blue) are taken as sRGB, integers as a
-// part of the type's largest; other properties and elements that are not positions and faces are skipped, polygons
-// become fans. Throws std::runtime_error with `name`, what was expected and what was found. `notes` gets what was left
-// out, if not null.
+// Reads ASCII, or binary of either byte order. Vertex colours (red, green, blue) are taken as sRGB; integers count as a
+// part of their type's largest value. Properties and elements other than positions and faces are skipped; polygons
+// become fans of triangles. Throws std::runtime_error with `name`, what was expected and what was found. `notes` gets
+// what was left out, if not null.
 inline Mesh parsePly(std::string_view bytes, const std::string& name, Notes* notes = nullptr)
 {
     return detail::PlyReader(bytes, name, notes).read();

@@ -1,5 +1,5 @@
-// The shares of a PLY file that ranks read together: of a binary one ranges of rows, whose places follow from their
-// number; of one in ASCII ranges of lines, where each row is one.
+// The shares of a PLY file that ranks read together. A share of a binary file is a range of rows, whose positions
+// follow from their numbers; a share of an ASCII file is a range of lines, each of which is a row.
 #pragma once
 
 #include "file_share.hpp"
@@ -15,7 +15,7 @@ namespace detail {
 // One file whose header has been read.
 class PlyShares {
 public:
-    // Throws std::runtime_error if the header is not as it should be, or very long.
+    // Throws std::runtime_error if the header is wrong or very long.
     PlyShares(const std::string& path, const Loaders& loaders, Notes* notes)
         : path_(path), loaders_(loaders), size_(fileSize(path)), header_(headerOf(path, size_, loaders)),
           reader_(header_, path, notes)
@@ -26,7 +26,8 @@ public:
 
     bool isAscii() const { return reader_.isAscii(); }
 
-    // This rank's rows of the vertices and faces of a binary file. False, or an error, if rows have not all one length.
+    // Reads this rank's rows of the vertices and faces of a binary file. Returns false or throws if the rows of an
+    // element differ in length.
     bool readRows(Mesh& mesh)
     {
         std::uint64_t at = begin_;
@@ -62,7 +63,7 @@ public:
         return true;
     }
 
-    // This rank's lines of one in ASCII, and how many of them are rows.
+    // Reads this rank's lines of an ASCII file. Returns how many of them are rows.
     std::uint64_t readLines()
     {
         lines_ = readLinesOfShare(path_, begin_, size_, loaders_);
@@ -71,7 +72,8 @@ public:
             rows += !isBlank(lines.next());
         return rows;
     }
-    // These lines, the first of which has this number of all `count` rows. False, or an error, if a line is not a row.
+    // Parses these lines. The first row has number `first` of all `count` rows. Returns false or throws if a line is
+    // not a row.
     bool parseLines(std::uint64_t first, std::uint64_t count, Mesh& mesh)
     {
         std::uint64_t all = 0;
@@ -112,7 +114,8 @@ private:
     }
     static bool isBlank(std::string_view line) { return nextWord(line).empty(); }
 
-    // Of all rows of an element that begins at a byte, if a face has as many vertices as the first has; 0: they differ.
+    // The bytes of a row of the element that begins at byte `at`, if all faces have as many vertices as the first one.
+    // 0 if rows can differ in other ways, or the first face is wrong.
     std::uint64_t rowBytesOf(const PlyElement& element, std::uint64_t at)
     {
         std::uint64_t bytes = 0;
@@ -144,9 +147,9 @@ private:
 
 } // namespace detail
 
-// Collective: what parsePly() makes of a file, of which each rank reads a share. Nothing, on all ranks, if anything is
-// not as it should be, or faces of a binary file have different numbers of vertices: parsePly() of the whole reads it,
-// or says what is wrong.
+// Collective: the same as parsePly(), but each rank reads a share of the file. Returns nothing, on all ranks, if
+// anything is wrong, or if faces of a binary file have different numbers of vertices. parsePly() of the whole file then
+// reads it, or says what is wrong.
 inline std::optional<MeshShare> readPlyShare(const std::string& path, const Loaders& loaders, Notes* notes)
 {
     std::optional<detail::PlyShares> shares;

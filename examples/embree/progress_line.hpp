@@ -14,8 +14,8 @@
 
 namespace example {
 
-// "frame 2 of 8, 120 of 260 tiles of this rank, 12 s, 35 s to go": `tiles` of the frame are done of about `expected`,
-// and time goes by tiles.
+// "frame 2 of 8, 120 of 260 tiles of this rank, 12 s, 35 s to go": `tiles` of about `expected` tiles of the frame are
+// done, from which the time to go is estimated.
 inline std::string progressText(int frame, int frameCount, std::int64_t tiles, std::int64_t expected, double seconds)
 {
     const std::int64_t all = std::max({expected, tiles, std::int64_t{1}});
@@ -35,7 +35,7 @@ public:
     // Silent unless `enabled`.
     ProgressLine(bool enabled, int frameCount) : enabled_(enabled), frameCount_(frameCount) {}
 
-    // `tiles`: of this rank in the frame, about.
+    // `tiles`: about how many tiles this rank renders in the frame.
     void beginFrame(int frame, std::int64_t tiles)
     {
         frame_ = frame;

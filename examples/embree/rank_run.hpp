@@ -1,4 +1,4 @@
-// RankRun: loads what a rank holds, renders the frames in the way that was asked for, and writes the files.
+// RankRun: loads a rank's part of the scene, renders the frames as the options say, and writes the files.
 #pragma once
 
 #include "on_all_ranks.hpp"
@@ -42,7 +42,8 @@ public:
         try {
             fb_ = makeFrames(connection, o_, config, verification_);
         } catch (const dfb::InvalidArgument&) {
-            // All ranks throw it. A connection that ends while an exception passes tells the others that it has failed.
+            // All ranks throw it, so the connection ends here. One that ends during an exception tells the others that
+            // it failed.
             connection.reset();
             throw;
         }
@@ -78,10 +79,10 @@ public:
 private:
     // A rank could not write a file of an earlier frame. Thrown on all ranks at the end of the same frame.
     struct CannotWrite {};
-    // Of Frame::addFigure(), for that. No brick and tile have it.
+    // The key of Frame::addFigure() that tells the others. No brick or tile has it.
     static constexpr std::uint64_t cannotWriteKey = ~std::uint64_t{0};
 
-    // As the function of that name; its end counts as compositing: waiting for others.
+    // Like the function of that name. Waiting for the other ranks counts as compositing.
     template <class Step>
     bool onAllRanks(const Step& step)
     {
@@ -119,8 +120,8 @@ private:
             params_.background = {(*o_.background)[0], (*o_.background)[1], (*o_.background)[2], 1.0f};
     }
 
-    // Writes what this rank has of the files of the frame that ended last. If that fails, what is wrong is kept and no
-    // other file written.
+    // Writes this rank's files of the frame that ended last. If that fails, it keeps the error and writes no other
+    // file.
     void writeFrame(int frame)
     {
         clock_.enter(Phase::Write);
@@ -156,7 +157,7 @@ private:
             endFirst();
     }
 
-    // About how many tiles this rank renders in a frame, those of each sample and brick by themselves.
+    // About how many tiles this rank renders in a frame. A tile counts once for each sample and brick.
     std::int64_t tilesAhead(int frame) const
     {
         if (isSingle(compositing_))
@@ -174,7 +175,7 @@ private:
         frames_[static_cast<std::size_t>(frame)].times.renderMs += clock_.enter(Phase::Compositing);
     }
 
-    // Ends the oldest frame that is open, which is this one.
+    // Ends the oldest open frame, which is number `frame`.
     dfb::FrameReport end(int frame)
     {
         if (!writeError_.empty())
@@ -255,7 +256,7 @@ private:
         });
     }
 
-    // `frames`: of one rank behind the other.
+    // `frames`: all frames of rank 0, then those of rank 1, and so on.
     RunStats statsOf(const std::vector<RankStats>& ranks, const std::vector<RankFrameStats>& frames) const
     {
         RunStats stats;

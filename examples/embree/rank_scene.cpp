@@ -39,14 +39,15 @@ Scene makeScene(const Options& options, int brickCount, const Loaders& loaders)
     return scene;
 }
 
-// Whether a rank holds a brick: `copies` ranks in a row do.
+// Whether a rank holds a brick: `copies` consecutive ranks do.
 bool holdsBrick(int rank, int brick, int brickCount, int rankCount, int copies)
 {
     const int first = rankOfBrick(brick, brickCount, rankCount);
     return (rank - first + rankCount) % rankCount < copies;
 }
 
-// A body in computed tomography stands: along z, as its slices go from the feet to the head by the usual convention.
+// Whether the scene is a body in computed tomography, which stands along z: by the usual convention its slices go from
+// the feet to the head.
 bool stands(const Scene& scene)
 {
     return !scene.volumes.empty()
@@ -54,7 +55,8 @@ bool stands(const Scene& scene)
                           [](const VolumeObject& volume) { return volume.source.look.isTomography; });
 }
 
-// Of surfaces without secondary rays, a brick's work is what its box covers of the image, so that equal boxes are best.
+// Whether to cut by content. For surfaces without secondary rays, a brick's work is the area that its box covers in the
+// image, so equal boxes are best.
 bool cutsByContent(const Options& options, const Scene& scene)
 {
     if (options.cut != CutBy::Auto)
@@ -93,7 +95,7 @@ RankScene loadRankScene(const Options& options, const Loaders& loaders)
     std::vector<Box> cells{scene.bounds};
     if (!isImage && cutsByContent(options, scene)) {
         const ContentCut cut(scene, result.info, settings, loaders);
-        cells = loaders.gatherOf<Box>([&] { // rank 0 tells, in case the others are other machines
+        cells = loaders.gatherOf<Box>([&] { // the cells of rank 0 hold, in case other machines compute others
             return rank > 0 ? std::vector<Box>() : cut.cells(brickCount * options.interleave);
         });
     } else if (!isImage) {

@@ -11,7 +11,7 @@
 
 namespace example {
 
-// The ranks of a framebuffer, which outlives them. No frame may be open while they load.
+// Loaders on the ranks of a framebuffer, which must outlive them. No frame may be open while they load.
 template <class FrameBuffer>
 Loaders loadersOf(FrameBuffer& fb)
 {
@@ -24,10 +24,10 @@ struct RankScene {
     SceneInfo info;
     std::vector<std::uint32_t> brickIds; // of the bricks that this rank holds, ascending
     std::vector<Box> bounds;             // of all bricks, by brick id; in image mode one, the whole scene
-    // For each of brickIds one per cell: a brick has one, or with --interleave several that are apart.
+    // For each of brickIds, one renderer per cell. A brick has one cell, or with --interleave several that are apart.
     std::vector<std::vector<Renderer>> renderers;
     Notes notes; // for the user, the same on all ranks
-    View view;   // the user's, and where it says nothing what suits the scene
+    View view;   // the user's; what it leaves open suits the scene
 
     const std::vector<Renderer>& of(std::uint32_t brickId) const
     {

@@ -48,7 +48,7 @@ std::size_t mostHits(const RenderSettings& settings, float opacity)
 {
     if (settings.pathBounces > 0)
         return 1;
-    double through = 1; // reckoned as in Ray
+    double through = 1; // computed as in Ray
     for (std::size_t hits = 1; hits <= 100; ++hits) {
         through *= 1 - static_cast<double>(opacity);
         if (through <= 0 || through < static_cast<double>(settings.earlyTermination))
@@ -57,7 +57,7 @@ std::size_t mostHits(const RenderSettings& settings, float opacity)
     return std::numeric_limits<std::size_t>::max();
 }
 
-// The direction of a set that is distributed by the cosine around a normal, of two numbers from 0 to 1.
+// Maps two numbers from 0 to 1 to a direction around a normal, with a cosine distribution.
 Vec3 cosineDirection(const Vec3& normal, double u, double v)
 {
     const double angle = 2 * 3.14159265358979323846 * v, r = std::sqrt(u);
@@ -67,7 +67,7 @@ Vec3 cosineDirection(const Vec3& normal, double u, double v)
     return toFloat(unit(a * (r * std::cos(angle)) + b * (r * std::sin(angle)) + n * std::sqrt(1 - u)));
 }
 
-// That of number `index`.
+// Direction number `index` of a ray with this key.
 Vec3 cosineDirection(const Vec3& normal, std::uint64_t key, int index)
 {
     const std::uint64_t h = hash64(key, static_cast<std::uint64_t>(index));
@@ -76,14 +76,14 @@ Vec3 cosineDirection(const Vec3& normal, std::uint64_t key, int index)
 
 Vec3 product(const Vec3& a, const Vec3& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
 
-// Narrows a piece of a ray, from `enter` to `leave`, to what is in a box; false if that is nothing.
+// Clips the piece of a ray from `enter` to `leave` to a box. Returns false if nothing is left.
 bool clip(const Box& box, const Vec3& origin, const Vec3& inverse, float& enter, float& leave)
 {
     for (int i = 0; i < 3; ++i) {
         const float from = component(origin, i), steps = component(inverse, i);
         const float a = (component(box.lo, i) - from) * steps, b = (component(box.hi, i) - from) * steps;
         if (std::isnan(a) || std::isnan(b))
-            continue; // 0 * infinity, of a ray within a face, limits nothing
+            continue; // 0 * infinity: a ray within a face has no limit
         enter = std::max(enter, std::min(a, b));
         leave = std::min(leave, std::max(a, b));
     }
@@ -127,7 +127,7 @@ struct Renderer::Ray {
     }
 };
 
-// The numbers of a ray: a function of pixel, sample, frame and seed alone.
+// The random numbers of a ray. They depend on pixel, sample, frame and seed only.
 struct Renderer::RaySample {
     std::uint64_t key = 0;
     dfb::LensSample lens;
@@ -163,7 +163,7 @@ Renderer::Renderer(Brick brick, const SceneInfo& scene, const RenderSettings& se
         hasIsosurfaces_ |= !volume.look().isovalues.empty();
 }
 
-// One function for all tile types and so one machine code for all bricks.
+// One function for all tile types, so that all bricks run the same machine code.
 std::int64_t Renderer::render(const Target& to, int frameIndex) const
 {
     if (volumes_.empty() && surfaces_.empty())
@@ -233,8 +233,8 @@ Renderer::RaySample Renderer::sampleAt(int x, int y, int index, int frameIndex) 
     return sample;
 }
 
-// The part of the sky that a hit sees, as far as the rays look: the R2 sequence of Roberts, which has less noise
-// than chance. Of everything that the brick has, in its cell or not.
+// The part of the sky that a hit sees, if only what is within reach can hide it. Directions follow the R2 sequence of
+// Roberts, which has less noise than random ones. Everything that the brick has counts, in its cell or not.
 float Renderer::openness(const Hit& hit, const Vec3& point, const Vec3& direction, std::uint64_t key) const
 {
     const Vec3 normal = dot(hit.normal, direction) > 0 ? hit.normal * -1.0f : hit.normal;
@@ -281,7 +281,7 @@ void Renderer::trace(Ray& ray, Tools& tools) const
     const Vec3 &origin = ray.origin, &direction = ray.direction;
     const Vec3 inverse{1 / direction.x, 1 / direction.y, 1 / direction.z};
     float enter = 0, leave = std::numeric_limits<float>::max();
-    // Wider than the cell by more than rounding: it is the points that decide.
+    // Wider than the cell by more than rounding, because each point is tested again later.
     const Box reach = cell_.padded(1e-5f * (scene_.bounds.largestExtent() + length(origin)));
     if (!clip(reach, origin, inverse, enter, leave))
         return;
@@ -386,14 +386,14 @@ void Renderer::addHit(Ray& ray, const Hit& hit, const Light& light) const
         if (settings_.shadows && surfaces_.occluded(point, light.direction, 1e-3f * reach, reach))
             c = hit.color * light.ambient * opacity;
         if (settings_.aoRays > 0)
-            c = c * (0.3f + 0.7f * openness(hit, point, ray.direction, ray.key)); // some comes by many bounces
+            c = c * (0.3f + 0.7f * openness(hit, point, ray.direction, ray.key)); // some light comes by many bounces
         ray.cost += settings_.shadows + settings_.aoRays;
     }
     ray.add(hit, c, opacity);
 }
 
-// Where the ray meets isosurfaces between samples k - 1 and k, front to back: those of its points that are in the
-// cell. The values at both samples, which may be a step outside of it, are the same in all bricks.
+// Finds the points in the cell where the ray meets isosurfaces between samples k - 1 and k, front to back. The samples
+// may be a step outside of the cell; their values are the same in all bricks.
 void Renderer::findCrossings(const Vec3& origin, const Vec3& direction, int k, std::vector<VolumeRay>& rays,
                              std::vector<Hit>& crossings) const
 {

@@ -1,8 +1,8 @@
 // Renderer: renders one brick into one tile at a time.
 //
-// Everything that several bricks must agree on is a pure function of the scene and the pixel: where the ray goes,
-// where its samples are, whose a sample or a hit is (that of the half-open cell that its point is in). So the image
-// does not depend on how the scene was cut.
+// Everything that several bricks must agree on is a pure function of the scene and the pixel: where the ray goes, where
+// its samples are, which brick has a sample or a hit (the one whose half-open cell its point is in). So the image does
+// not depend on how the scene was cut.
 #pragma once
 
 #include "camera.hpp"
@@ -28,17 +28,17 @@ struct SceneInfo {
     {
         for (const VolumeObject& volume : scene.volumes)
             step = std::min(step, 0.5f * volume.placement.size());
-        step = std::max(step, bounds.largestExtent() * 0x1.0p-17f); // a tiny volume far from all else
+        step = std::max(step, bounds.largestExtent() * 0x1.0p-17f); // for a tiny volume far from all else
     }
 };
 
-// The camera of a frame, equal on all ranks, with or without a brick.
+// The camera of a frame, the same on all ranks, also on those without a brick.
 inline FrameCamera frameCamera(const SceneInfo& scene, const RenderSettings& settings, int frameIndex)
 {
     return FrameCamera(scene.focus, settings.view, frameIndex, settings.frames, settings.width, settings.height);
 }
 
-// How far secondary rays reach beyond a brick's cell, in world space: so far it needs ghosts.
+// How far secondary rays reach beyond a brick's cell, in world space, and so how far the brick needs ghosts.
 inline float ghostReach(const SceneInfo& scene, const RenderSettings& settings)
 {
     return settings.aoRays > 0 || settings.shadows ? settings.aoDistance * scene.bounds.largestExtent() : 0;
@@ -46,15 +46,15 @@ inline float ghostReach(const SceneInfo& scene, const RenderSettings& settings)
 
 class Renderer {
 public:
-    // Throws std::runtime_error if Embree does. A brick from loadBrick().
+    // Takes a brick from loadBrick(). Throws std::runtime_error if Embree fails.
     Renderer(Brick brick, const SceneInfo& scene, const RenderSettings& settings);
 
-    // For the tiles that are rendered from now on: other views, sizes and passes. Not while one is.
+    // Sets view, size and passes of the tiles that are rendered from now on. Not while one is being rendered.
     void look(const RenderSettings& settings) { settings_ = settings; }
 
-    // Renders the brick into the channels that the tile has (tile.region, tile.sample); the tile comes cleared, and
-    // pixels where the brick has nothing stay so. Returns what it has cost: samples of volumes and secondary rays, and
-    // one for each camera ray that comes near. From any number of threads.
+    // Renders the brick into the channels that the tile has (tile.region, tile.sample); the tile must be cleared, and
+    // pixels where the brick has nothing stay so. Returns the cost: the number of volume samples and secondary rays,
+    // and one for each camera ray that comes near. Any number of threads at once.
     template <class Tile>
     std::int64_t renderTile(Tile& tile, int frameIndex) const
     {
@@ -113,9 +113,10 @@ private:
     RenderSettings settings_;
     SceneInfo scene_;
     Box cell_;
-    std::size_t mostHits_; // by the brick's parts, which the next one takes
+    std::size_t mostHits_; // from the brick's parts, which the next member takes
     Surfaces surfaces_;
-    // Whether hits are left out that ghosts hide, which other bricks show: one ray instead of those of each hit.
+    // Whether to test first, with one ray, if ghosts hide all hits. Other bricks show the ghosts, and the hits need no
+    // rays then.
     bool looksAhead_ = false;
     bool hasIsosurfaces_ = false;
     std::vector<VolumeSampler> volumes_;

@@ -9,12 +9,12 @@
 
 namespace example {
 
-// The exit code, the same on all ranks; what is thrown is not caught.
+// Return the exit code, the same on all ranks. Exceptions are not caught.
 int runInproc(const dfb::InprocCommunicator& communicator, const Options& options, int threads);
 #if defined(DFB_HAS_MPI)
 int runMpi(MPI_Comm communicator, const Options& options, int threads);
 #endif
-// Of either; with --live.
+// For either transport, with --live.
 int runLive(std::shared_ptr<dfb::Connection> connection, const Options& options, int threads);
 
 } // namespace example

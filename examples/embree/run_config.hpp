@@ -1,4 +1,4 @@
-// RunConfig: what the options say, as the library wants it: the framebuffer's configuration, the world, the wall.
+// RunConfig: converts the options to what the library takes: the framebuffer's configuration, the world, the wall.
 #pragma once
 
 #include "options.hpp"
@@ -52,7 +52,8 @@ inline bool isAdaptive(Compositing how)
     return how == Compositing::SingleAdaptive || how == Compositing::SortAdaptive;
 }
 
-// Unless 8 bits per channel are all that is written. They lose too much to divide by alpha, as a PNG with alpha wants.
+// Whether the image needs floats: unless all that is written has 8 bits per channel. Those are too inexact to divide by
+// alpha, which a PNG with alpha needs.
 inline bool wantsFloat(const Options& o)
 {
     return !o.stats.empty() || !o.alpha.empty() || (!o.output.empty() && !o.background) || endingOf(o.output) == ".pfm"

@@ -1,4 +1,4 @@
-// RunFiles: the files that a run writes: their names, whether they can be written, and those of a frame.
+// RunFiles: the files that a run writes. Finds their names, checks whether they can be written, and writes them.
 #pragma once
 
 #include "cinema.hpp"
@@ -65,7 +65,7 @@ public:
             writeIdPng(aux + ".instance.png", width, height, image.instanceId());
         }
     }
-    // Those of the displays that `rank` drives.
+    // Writes the files of the displays that `rank` drives.
     void write(int frame, const dfb::DisplayWall& wall, int rank) const
     {
         const std::string output = pathOf(o_.output, frame);
@@ -110,7 +110,7 @@ public:
     }
 
 private:
-    // The files of a frame whose names have its number; or those that are written once.
+    // The files of a frame whose names have its number, or else those that are written once.
     std::vector<std::string> paths(int frame, bool areNumbered) const
     {
         std::vector<std::string> all;
@@ -161,7 +161,7 @@ private:
         return path.substr(0, dot) + '.' + std::to_string(number) + path.substr(dot);
     }
 
-    // A .pfm, or a .png that has alpha unless the image is opaque.
+    // Writes a .pfm, or a .png that has alpha unless the image is opaque.
     static void writeImage(const std::string& path, const dfb::Image& image, bool isOpaque, bool dither)
     {
         const int width = image.width(), height = image.height();

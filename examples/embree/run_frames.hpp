@@ -1,5 +1,5 @@
-// RunFrames: the frames of a run: a framebuffer with whatever operations the options ask for, and the loop over it.
-// What a run does with its frames does not depend on the operations, and is compiled once.
+// RunFrames: the frames of a run: a framebuffer with whatever operations the options ask for, and the loop over it. The
+// rest of a run does not depend on the operations, so it is compiled only once.
 #pragma once
 
 #include "options.hpp"
@@ -17,12 +17,12 @@
 
 namespace example {
 
-// What a rank renders. It is loaded by way of the framebuffer, so that comes first.
+// What a rank renders. It is loaded with the help of the framebuffer, so the framebuffer is made first.
 struct RankWork {
     std::unique_ptr<RankScene> scene;
     RenderSettings settings;
     dfb::World world;
-    std::optional<dfb::SharedWorld> shared;          // but with Mode::Image
+    std::optional<dfb::SharedWorld> shared;          // except with Mode::Image
     std::function<void(std::int64_t work)> tileDone; // from any thread
 };
 
@@ -30,7 +30,7 @@ class RunFrames {
 public:
     virtual ~RunFrames() = default;
 
-    // As DistributedFrameBuffer has them.
+    // As in DistributedFrameBuffer.
     virtual int rank() const = 0;
     virtual int size() const = 0;
     virtual const dfb::FrameBufferConfig& config() const = 0;
@@ -41,25 +41,25 @@ public:
                                                           const char* call = "allGather()") = 0;
     bool isDisplayRank() const { return rank() == config().image.displayRank; }
 
-    // Null: there is none.
+    // Null if there is none.
     virtual const dfb::DisplayWall* wall() const = 0;
 
     // Begins frame number `frame` of the run, and renders what this rank has to.
     virtual void start(int frame, const RankWork& work, const dfb::FrameConfig& params) = 0;
     // How many frames have begun and not ended.
     virtual int openCount() const = 0;
-    // Of the oldest of them; see Frame. What end() throws leaves it to leaveAll().
+    // For the oldest open frame; see Frame. If end() throws, the frame stays for leaveAll().
     virtual void addFigure(std::uint64_t key, double value) = 0;
     virtual dfb::FrameReport end() = 0;
-    // Leaves all of them without end().
+    // Destroys all open frames without end().
     virtual void leaveAll() = 0;
 };
 
-// Collective. `options` and `verification`, which a compositing that checks itself reports to, must outlive the frames.
-// Throws as the constructor of DistributedFrameBuffer does.
+// Collective. `options` and `verification` must outlive the frames. A compositing that checks itself reports to
+// `verification`. Throws as the constructor of DistributedFrameBuffer does.
 std::unique_ptr<RunFrames> makeFrames(std::shared_ptr<dfb::Connection> connection, const Options& options,
                                       const dfb::FrameBufferConfig& config, dfb::testing::Verification& verification);
-// For a compositing of single inputs.
+// The same, for a compositing where each tile has one input.
 std::unique_ptr<RunFrames> makeSingleFrames(std::shared_ptr<dfb::Connection> connection, const Options& options,
                                             const dfb::FrameBufferConfig& config,
                                             dfb::testing::Verification& verification);

@@ -1,8 +1,8 @@
 // Scene: what there is to render, and the bricks that it is cut into.
 //
 // World space: each file is scaled and centred to fill the unit cube, unless told not to. Cells are a pure function of
-// the bounds and their number, so every rank knows all of them, and two cells that share a face have the same number
-// for it.
+// the bounds and their number, so every rank knows all of them, and two cells that share a face have exactly the same
+// coordinate for it.
 #pragma once
 
 #include "clip.hpp"
@@ -20,8 +20,8 @@
 
 namespace example {
 
-// Scanners store the rows of an image from the top, so a volume stands with y down and, to stay no mirror image of
-// itself, with z backwards.
+// Scanners store the rows of an image from the top, so a volume is placed with y down and also with z backwards;
+// otherwise it would be its own mirror image.
 struct VolumeObject {
     VolumeSource source;
     Placement placement;        // of voxels by their index, before the rotation
@@ -30,7 +30,7 @@ struct VolumeObject {
     std::uint32_t geometry = 0; // if it has isosurfaces
 
     // Throws std::runtime_error, which names the file, if floats have too few digits to tell the volume's voxels apart,
-    // or nothing of it is left.
+    // or if the clip box leaves nothing of it.
     VolumeObject(VolumeSource volume, bool fit, const FileLook& look = {}) : source(std::move(volume))
     {
         const Index3& d = source.info.dims;
@@ -39,7 +39,7 @@ struct VolumeObject {
         shown.lo = {0, 0, 0};
         shown.hi = last;
         placement.scale = spacing;
-        placement.offset = fit ? Vec3() : origin; // it is centred
+        placement.offset = fit ? Vec3() : origin; // fitting centres it
         const Placement fitted = fitToUnitCube(upright(), fit);
         placement.offset = fitted.toWorld(placement.offset);
         placement.scale = placement.scale * fitted.size();
@@ -54,7 +54,7 @@ struct VolumeObject {
         }
         for (int axis = 0; axis < 3; ++axis)
             if (!(std::max(std::fabs(component(upright().lo, axis)), std::fabs(component(upright().hi, axis)))
-                  <= 131072 * std::fabs(component(placement.scale, axis)))) // what addVolume() allows for rounding
+                  <= 131072 * std::fabs(component(placement.scale, axis)))) // as far as addVolume() allows for rounding
                 throw std::runtime_error(source.name + ": its voxels are too small beside "
                                          + (fit ? "its extent" : "the distance from 0 to its end")
                                          + ", which can be 131072 of their sides at most");
@@ -88,7 +88,7 @@ struct VolumeObject {
     }
 };
 
-// A mesh, or a run of its triangles where several ranks have loaded it together.
+// A mesh, or a run of its triangles if several ranks have loaded it together.
 struct MeshObject {
     std::uint32_t geometry = 0; // number among the meshes and sphere sets of the scene
     Mesh mesh;                  // in world space
@@ -152,7 +152,7 @@ struct Scene {
         add(SphereShare{std::move(set), 0}, fit, {}, look, name);
     }
 
-    // Collective: of a mesh, or of spheres, this rank's share. They throw the same on all ranks.
+    // Collective: add this rank's share of a mesh or of spheres. They throw the same on all ranks.
     void add(MeshShare share, bool fit, const Loaders& loaders, const FileLook& look = {}, const std::string& name = {})
     {
         const VertexSet vertices(share.mesh.triangles);
@@ -207,7 +207,7 @@ struct Scene {
     }
 
 private:
-    // Of what the triangles use: a file may hold vertices that nothing does.
+    // The box of the vertices that triangles use; a file may have others.
     static Box boxOf(const Mesh& mesh)
     {
         Box box;
@@ -225,8 +225,8 @@ private:
         return all;
     }
 
-    // Collective: brings a mesh, or this rank's part of one, from its file's coordinates to the world, where the camera
-    // is to see it. Of the result only mesh, normals and number are missing.
+    // Collective: moves a mesh, or this rank's part of one, from its file's coordinates to the world, and adds it to
+    // what the camera shows. The result still lacks the mesh, its normals and firstPrimitive.
     MeshObject placed(Mesh& mesh, bool fit, const FileLook& look, const std::string& name, const Loaders& loaders = {})
     {
         static const Vec3 palette[] = {
@@ -261,7 +261,7 @@ private:
         return object;
     }
 
-    // `mayBeEmpty`: nothing was seen at a glance.
+    // `mayBeEmpty`: the rows that were looked at show nothing.
     void noteOn(const VolumeSource& source, bool mayBeEmpty)
     {
         const VolumeInfo& info = source.info;
@@ -280,7 +280,7 @@ private:
                         + (lo == hi ? "all voxels are " + textOf(lo)
                                     : "all voxels, from " + textOf(lo) + " to " + textOf(hi) + ", are transparent"));
     }
-    // Of a file of which something is seen in the world; `box` is in its own coordinates.
+    // Throws if nothing of a file is seen in the world. `box` is the file's box in its own coordinates.
     static void requireAnyOf(const Box& seen, const std::string& name, const Box& box)
     {
         if (seen.empty() && !box.empty())
@@ -296,8 +296,8 @@ private:
                  0);
     }
 
-    // `forEach` calls its argument with the centre and radius of all spheres of one object, or on each rank of its
-    // part. Returns the box of these. Collective over the loaders.
+    // `forEach` calls its argument with the centre and radius of each sphere around an object, on each rank for the
+    // rank's part of it. Returns the box around all spheres. Collective over the loaders.
     template <class ForEach>
     Box lookAt(const ForEach& forEach, const Loaders& loaders = {})
     {
@@ -327,7 +327,7 @@ private:
     }
 
     Box tight_, seen_;
-    std::vector<std::pair<Vec3, float>> balls_; // of each object, around all there is to see of it
+    std::vector<std::pair<Vec3, float>> balls_; // around the visible part of each object
     std::uint32_t nextGeometry_ = 0;
 };
 
@@ -367,8 +367,8 @@ inline Index3 nearCubicGrid(int count)
     return best;
 }
 
-// The cells of `count` bricks, by brick id: the scene's own grid, or bisection of the longest axis over and over
-// (in proportion where the number is odd).
+// The cells of `count` bricks, by brick id: the scene's own grid, or repeated bisection of the longest axis (in
+// proportion if the number is odd).
 inline std::vector<Box> cutScene(const Scene& scene, int count)
 {
     std::vector<Box> cells;

@@ -1,4 +1,4 @@
-// The files of a scene: who reads them, and how they come into it.
+// The files of a scene: how they are read and added to it.
 #pragma once
 
 #include "assimp_mesh.hpp"
@@ -15,13 +15,13 @@ namespace example {
 
 namespace detail {
 
-// Of a mesh file.
+// The two ways to read a kind of mesh file.
 struct MeshReader {
     Mesh (*parse)(std::string_view bytes, const std::string& name, Notes* notes);
     std::optional<MeshShare> (*readShare)(const std::string& path, const Loaders& loaders, Notes* notes);
 };
 
-// Of a file that cannot be shared out.
+// For files that cannot be shared out.
 inline std::optional<MeshShare> noShare(const std::string&, const Loaders&, Notes*) { return std::nullopt; }
 
 inline std::string readCounted(const std::string& path, const Loaders& loaders)
@@ -70,11 +70,11 @@ inline void addSpheres(Scene& scene, const SceneFile& file, bool fit, int frame,
 
 } // namespace detail
 
-// Collective: adds a file, by its ending. Each rank reads a share of it: of a volume here what all must know, and its
-// bricks later, in loadBrick(); of a mesh or of spheres a run of the primitives, which go to the bricks in
-// exchangeBricks(). Where a file of primitives cannot be shared out, as its rows are not all alike, or it is wrong,
-// rank 0 reads it alone. `xyzFrame` as for parseXyz(), `grid` and `lookOf` for volumes. Throws std::runtime_error that
-// names the file, the same on all ranks.
+// Collective: adds a file, whose ending tells its kind. Each rank reads a share of it. From a volume, it reads here
+// what all ranks must know, and its own bricks later, in loadBrick(). From a mesh or spheres, it reads a run of the
+// primitives, which exchangeBricks() sends to the bricks. If a file of primitives cannot be shared out, because its
+// rows differ in form or it is wrong, rank 0 reads it alone. `xyzFrame` as for parseXyz(), `grid` and `lookOf` for
+// volumes. Throws std::runtime_error that names the file, the same on all ranks.
 inline void addFile(Scene& scene, const SceneFile& file, bool fit, int xyzFrame = 0, const Loaders& loaders = {},
                     const VoxelGrid& grid = {}, const LookOf& lookOf = {})
 {

@@ -12,7 +12,7 @@ struct Light {
     Vec3 direction; // unit, from the surface to the light
     static constexpr float ambient = 0.30f;
 
-    // Diffuse and ambient part for a unit normal of which either side counts.
+    // Diffuse and ambient part for a unit normal; both sides of a surface are lit alike.
     float diffuse(const Vec3& normal) const { return ambient + 0.80f * std::fabs(dot(normal, direction)); }
 
     // Highlight for a unit normal and the unit direction of the view ray.

@@ -17,7 +17,7 @@ struct Sphere {
 // A rank's run of the spheres of a file that several ranks have read together.
 struct SphereShare {
     std::vector<Sphere> spheres;
-    std::uint64_t first = 0; // its number in the file
+    std::uint64_t first = 0; // the number of the first in the file
 };
 
 } // namespace example

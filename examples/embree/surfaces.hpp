@@ -1,7 +1,7 @@
 // Surfaces: the meshes and spheres of a brick in an Embree scene, and all points where a ray meets them.
 //
-// Embree says which primitives a ray meets. Where on the ray that is we compute from the primitive alone, in double,
-// so that it does not depend on what else is in the brick.
+// Embree finds the primitives that a ray meets. The distance along the ray is computed here, in double and from the
+// primitive alone, so that it does not depend on what else is in the brick.
 #pragma once
 
 #include "bricks.hpp"
@@ -166,14 +166,14 @@ private:
     struct Query {
         Context context;
         Vec3 origin, direction;
-        const Box* cell = nullptr;        // hits elsewhere do not count; null: they do
-        float farthest = 0;               // nor do hits from here on
+        const Box* cell = nullptr;        // hits outside of it do not count; null: all count
+        float farthest = 0;               // hits from this distance on do not count
         std::vector<Hit>* hits = nullptr; // front to back
         std::size_t most = 0;
-        // Embree need not look behind the last of `most` hits. Not with triangles: their distances, which Embree then
-        // compares with it, are not ours where they are seen edge-on.
+        // Whether Embree may end the search behind the last of `most` hits. Not if there are triangles: Embree would
+        // compare its own distances, and those of triangles that are seen edge-on differ from ours.
         bool mayEnd = false;
-        double from = 0, to = 0; // of occluded()
+        double from = 0, to = 0; // for occluded()
 
         // Takes the hit if it is in the cell and one of the first `most` so far.
         void keep(double distance, Hit hit, const std::optional<Clip>& clip) const
@@ -199,7 +199,7 @@ private:
             }
         }
         bool isFull() const { return hits->size() == most; }
-        // Whether the clip box of an object, if it has one, leaves the point at that distance.
+        // Whether the point at that distance is inside the clip box of its object, if there is one.
         bool shows(const std::optional<Clip>& clip, double distance) const
         {
             return !clip || clip->contains(pointAt(origin, direction, static_cast<float>(distance)));
@@ -262,7 +262,8 @@ private:
         const double determinant = dot(ab, p);
         u = determinant != 0 ? dot(o - a, p) / determinant : 0;
         v = determinant != 0 ? dot(d, q) / determinant : 0;
-        // Seen edge-on the plane says little about where: the point stays in the triangle and so in its box.
+        // If the triangle is seen edge-on, the point in its plane is inexact. It is kept in the triangle, and so in its
+        // box.
         u = std::clamp(u, 0.0, 1.0);
         v = std::clamp(v, 0.0, 1.0 - u);
         return dot(a + ab * u + ac * v - o, d) / dot(d, d);
@@ -277,7 +278,7 @@ private:
                        + toDouble(colors[triangle[2]]) * v);
     }
 
-    // Notes the hit and rejects it, so that Embree goes on to the next one.
+    // Records the hit and rejects it, so that Embree goes on to the next one.
     static void onTriangle(const RTCFilterFunctionNArguments* arguments)
     {
         if (arguments->valid[0] == 0)
@@ -348,7 +349,8 @@ private:
         bounds.upper_z = sphere.center.z + radius;
     }
 
-    // Where the ray enters, or if that is clipped away, leaves; tells Embree of no hit, so that it goes on.
+    // Records where the ray enters the sphere, or where it leaves if the entry is clipped away. Tells Embree of no hit,
+    // so that it goes on.
     static void onSphere(const RTCIntersectFunctionNArguments* arguments)
     {
         if (arguments->valid[0] == 0)

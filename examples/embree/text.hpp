@@ -1,4 +1,4 @@
-// Text: the lines, words and numbers of text files, and what a reader has to say of a file that it takes.
+// Text: the lines, words and numbers of text files, and a reader's notes about a file that it accepts.
 #pragma once
 
 #include <algorithm>
@@ -11,10 +11,10 @@
 
 namespace example {
 
-// Each a line for the user about something that is not as the file, or an option, may have meant it.
+// Lines for the user. Each says what may differ from what the file, or an option, was meant to say.
 using Notes = std::vector<std::string>;
 
-// With its dot; empty if there is none.
+// The ending of a path, with its dot; empty if there is none.
 inline std::string endingOf(const std::string& path) { return path.substr(std::min(path.rfind('.'), path.size())); }
 
 // Goes through a text line by line. Lines end with \n, \r\n or \r.

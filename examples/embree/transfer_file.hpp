@@ -3,9 +3,9 @@
 //     {"range": [0, 300], "points": [{"value": 0, "color": [0.2, 0.2, 0.3], "opacity": 0},
 //                                    {"value": 1, "color": "#ffddaa", "opacity": 0.4}]}
 //
-// The values ascend. They are values of the data; with "range" 0 and 1 stand for its ends, with "range": "auto" for
-// those of what is shown by default. Colours are as a screen shows them. The opacity is that of a slab as thick as
-// 1/256 of the volume's largest extent. Between points both are linear.
+// The values ascend. Without "range" they are values of the data. With "range", 0 and 1 stand for its two ends; with
+// "range": "auto", for the ends of the range that is shown by default. Colours are sRGB. The opacity is that of a slab
+// as thick as 1/256 of the volume's largest extent. Colour and opacity are linear between points.
 #pragma once
 
 #include "color_maps.hpp"

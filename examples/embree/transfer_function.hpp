@@ -32,7 +32,7 @@ inline const TransferPoints& emberPoints()
     return points;
 }
 
-// Between the points, and beyond them as the outermost are.
+// Interpolates between the points; beyond them, the outermost one holds.
 inline TransferPoint at(const TransferPoints& points, float value)
 {
     if (value < points.front().value)

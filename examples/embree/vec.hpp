@@ -68,7 +68,7 @@ struct Box {
     bool empty() const { return !(lo.x <= hi.x && lo.y <= hi.y && lo.z <= hi.z); }
     Vec3 extent() const { return hi - lo; }
     Vec3 center() const { return (lo + hi) * 0.5f; }
-    // Number `i` of 8.
+    // Corner number `i` of 8.
     Vec3 corner(int i) const { return {i & 1 ? hi.x : lo.x, i & 2 ? hi.y : lo.y, i & 4 ? hi.z : lo.z}; }
     float largestExtent() const { return std::max({hi.x - lo.x, hi.y - lo.y, hi.z - lo.z}); }
     void grow(const Vec3& p, float radius = 0)
@@ -123,7 +123,7 @@ inline Box intersection(const Box& a, const Box& b)
 // The part of the world that a camera looks at.
 struct Focus {
     Box box;
-    float radius = 0; // of the ball around the box's centre that holds all there is to see
+    float radius = 0; // of the ball around the box's centre that holds all that is visible
 };
 
 // splitmix64: a hash of 64 bits to 64 bits.

@@ -36,14 +36,14 @@
 
 namespace example {
 
-// Of the blocks that a ray steps over at once where nothing in them can be seen, in voxels.
+// The width in voxels of the blocks that a ray skips at once if nothing in them is visible.
 inline constexpr int skipWidth = 8;
 
 struct VolumeInfo {
     Index3 dims{};
     VoxelType type = VoxelType::UInt8;
     float minimum = 0, maximum = 255; // mapped to 0 and 1, unless there is another range to show
-    float least = 0;                  // of the voxels; `minimum` may be greater
+    float least = 0;                  // the least voxel; `minimum` may be greater
     std::uint64_t notFinite = 0;      // voxels, which count as the minimum
     Vec3 spacing{1, 1, 1};            // between voxels
     Vec3 origin;                      // of the centre of the first voxel
@@ -52,18 +52,18 @@ struct VolumeInfo {
 // Copies the voxels [lo, hi) to `out`, x fastest. Throws std::runtime_error. Called by one thread at a time.
 using BoxReader = std::function<void(const Index3& lo, const Index3& hi, std::byte* out)>;
 
-// Where there is something to see, as far as some rows of the volume show it, on a lattice of about 64^3 voxels.
+// Which voxels are visible, as far as some rows of the volume show, on a lattice of about 64^3 voxels.
 struct VisibleVoxels {
-    // To point a camera: the ends of rows that stand out from the background, in voxels.
+    // For the camera: the first and last points of rows that stand out from the background, in voxels.
     std::vector<Vec3> points;
-    int slack = 0; // how many voxels beyond these the lattice leaves out
+    int slack = 0; // how many voxels beyond these the lattice may have missed
 
-    // To reckon what it costs: blocks of `width` voxels, x fastest, each 1 if something in it has an opacity, else 0.
+    // For the cost: blocks of `width` voxels, x fastest. Each is 1 if something in it has an opacity, otherwise 0.
     Index3 width{}, blocks{};
     std::vector<std::uint8_t> isSeen;
 };
 
-// The user's spacing and origin, in place of those of the file.
+// The user's spacing and origin, which replace those of the file.
 struct VoxelGrid {
     std::optional<Vec3> spacing, origin;
 };
@@ -81,7 +81,7 @@ struct VolumeSource {
 
 // ---- files -----------------------------------------------------------------------------------------------------
 
-// Of voxels [begin, end), in file order. Adds what it reads to `bytesRead`. `file` as findVoxels() left it.
+// The range of voxels [begin, end), in file order. Adds what it reads to `bytesRead`. `file` as findVoxels() left it.
 inline VoxelRange scanVoxels(std::istream& stream, const VolumeFile& file, std::uint64_t begin, std::uint64_t end,
                              std::uint64_t& bytesRead)
 {
@@ -106,7 +106,8 @@ inline VoxelRange scanVoxels(std::istream& stream, const VolumeFile& file, std::
     return range;
 }
 
-// Of a whole volume: the range that its values are normalised over. Throws std::runtime_error that begins with `name`.
+// Sets the range over which the values of a whole volume are normalised. Throws std::runtime_error that begins with
+// `name`.
 inline void setRange(VolumeInfo& info, const VoxelRange& range, bool isFloat, const std::string& name)
 {
     const float lo = range.lo, hi = range.hi;
@@ -116,7 +117,7 @@ inline void setRange(VolumeInfo& info, const VoxelRange& range, bool isFloat, co
         throw std::runtime_error(name + ": not one of its voxels is finite");
     info.minimum = lo < 0 && hi > 0 && isFloat ? 0 : lo;
     info.maximum = hi;
-    if (hi == info.minimum) { // all alike: something above them, or else below
+    if (hi == info.minimum) { // all are equal: take a value above, or else one below
         info.maximum = hi + std::max(1.0f, std::fabs(hi) / 1024);
         if (!std::isfinite(info.maximum)) {
             info.minimum = hi / 2;
@@ -131,7 +132,7 @@ inline std::size_t voxelsOfBox(const Index3& lo, const Index3& hi)
     return extent(0) * extent(1) * extent(2);
 }
 
-// Of floats in memory, `count` of them.
+// Replaces infinities and NaN among `count` floats in memory.
 inline void replaceNotFinite(std::byte* voxels, std::size_t count, float replacement)
 {
     for (std::size_t i = 0; i < count; ++i, voxels += sizeof(float)) {
@@ -142,8 +143,8 @@ inline void replaceNotFinite(std::byte* voxels, std::size_t count, float replace
     }
 }
 
-// Collective: findVoxels() in this rank's own stream, and the range, of which each rank looks at a share of the
-// voxels. Throws std::runtime_error, the same on all ranks.
+// Collective: calls findVoxels() on this rank's own stream and finds the range, for which each rank reads a share of
+// the voxels. Throws std::runtime_error, the same on all ranks.
 inline VolumeInfo describeVolume(std::istream& stream, VolumeFile& file, const Loaders& loaders = {})
 {
     const VoxelRange range = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
@@ -169,7 +170,7 @@ inline BoxReader boxReader(std::shared_ptr<std::istream> stream, const VolumeFil
     return [stream, file, minimum = info.minimum, bytesRead, position = std::streamoff(-1),
             stored = std::vector<std::byte>()](const Index3& lo, const Index3& hi, std::byte* out) mutable {
         const VoxelFormat& format = file.format;
-        const bool areWhole = lo[0] == 0 && hi[0] == file.dims[0]; // rows, which then follow one another
+        const bool areWhole = lo[0] == 0 && hi[0] == file.dims[0]; // whole rows, which follow one another
         for (int z = lo[2]; z < hi[2]; ++z)
             for (int y = lo[1]; y < hi[1]; y = areWhole ? hi[1] : y + 1) {
                 const std::size_t voxels = voxelsOfBox({lo[0], y, z}, {hi[0], areWhole ? hi[1] : y + 1, z + 1}),
@@ -206,7 +207,7 @@ inline float voxelValue(VoxelType type, const std::byte* voxel)
     });
 }
 
-// Every how many voxels along an axis there is a row of the lattice that stands for a volume.
+// The number of voxels along an axis from one row of the lattice that stands for a volume to the next.
 inline int latticeStride(const VolumeInfo& info, std::size_t axis) { return 1 + (info.dims[axis] - 1) / 64; }
 
 // Collective: each rank reads a share of the rows. Throws std::runtime_error, the same on all ranks.
@@ -225,7 +226,7 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
     VisibleVoxels visible;
     visible.slack = std::max({stride(0), stride(1), stride(2)}) - 1;
     for (std::size_t axis = 0; axis < 3; ++axis) {
-        visible.width[axis] = std::max(skipWidth, stride(axis)); // a row or more in each
+        visible.width[axis] = std::max(skipWidth, stride(axis)); // so that each block has a row or more
         visible.blocks[axis] = 1 + (info.dims[axis] - 1) / visible.width[axis];
     }
     const TransferFunction transferFunction(1, look.points);
@@ -262,7 +263,7 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
     seenInRows = loaders.gatherOf<std::uint8_t>([&] { return seenInRows; });
     const auto size = [&](std::size_t axis) { return static_cast<std::size_t>(visible.blocks[axis]); };
     visible.isSeen.resize(size(0) * size(1) * size(2));
-    // A row speaks for what lies between it and the one before.
+    // A row stands for the voxels between it and the row before.
     const auto blocksOf = [&](std::size_t axis, std::uint64_t number) {
         const int last = static_cast<int>(number) * stride(axis), first = std::max(0, last - stride(axis));
         return std::pair(static_cast<std::size_t>(first / visible.width[axis]),
@@ -315,10 +316,10 @@ inline VolumeFile volumeFileOf(const std::string& path, const VoxelGrid& grid = 
     return file;
 }
 
-// Collective: how a volume is to be shown, of one of which all but its look is known.
+// Collective: chooses the look of a volume of which all else is known.
 using LookOf = std::function<VolumeLook(const VolumeSource&)>;
 
-// Collective: how a volume whose voxels can be read is shown, and where there is something to see.
+// Collective: finds the look of a volume whose voxels can be read, and which voxels are visible.
 inline void lookInto(VolumeSource& source, const Loaders& loaders, const LookOf& lookOf)
 {
     source.look.lo = source.info.minimum;
@@ -330,8 +331,8 @@ inline void lookInto(VolumeSource& source, const Loaders& loaders, const LookOf&
         source.range = rangeOf(source, loaders);
 }
 
-// Collective: the ranks share what has to be known of the whole volume. Without `lookOf` it is shown as a generated
-// volume is. Throws std::runtime_error, the same on all ranks.
+// Collective: each rank reads a share of what all must know of the whole volume. Without `lookOf` it is shown like a
+// generated volume. Throws std::runtime_error, the same on all ranks.
 inline VolumeSource openVolume(const std::string& path, const Loaders& loaders = {}, const VoxelGrid& grid = {},
                                const LookOf& lookOf = {})
 {
@@ -342,7 +343,7 @@ inline VolumeSource openVolume(const std::string& path, const Loaders& loaders =
     });
     const auto open = [data = file.data] {
         auto stream = std::make_shared<std::ifstream>();
-        // Without a buffer no byte is read that nobody asked for; rows are read as a whole.
+        // Without a buffer the stream reads only the bytes that are asked for; rows are read as a whole.
         stream->rdbuf()->pubsetbuf(nullptr, 0);
         stream->open(data, std::ios::binary);
         return stream; // one that is not open is a stream that cannot be read

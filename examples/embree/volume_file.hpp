@@ -23,7 +23,7 @@ using Index3 = std::array<int, 3>;
 
 // x fastest.
 struct VolumeFile {
-    std::string path;       // of the file that was asked for, with which errors begin
+    std::string path;       // of the file that was asked for; errors begin with it
     std::string data;       // of the file that has the voxels, which may be the same
     std::int64_t begin = 0; // of the first voxel, in bytes; -1: the voxels end where the file ends
     Index3 dims{};
@@ -44,8 +44,8 @@ inline bool isSpacing(double value) { return value >= 1e-15 && value <= 1e9; }
 inline bool isOrigin(double value) { return std::fabs(value) <= 1e12; }
 inline bool isDimension(int value) { return value >= 2 && value <= 65536; }
 
-// Dimensions and type as the file's name says: name_XxYxZ_type.raw (the Open SciVis convention), `be` behind the type:
-// big-endian. Throws std::runtime_error if it does not.
+// Takes dimensions and type from the file's name: name_XxYxZ_type.raw (the Open SciVis convention), with `be` behind
+// the type if big-endian. Throws std::runtime_error if the name does not have them.
 inline VolumeFile parseVolumeName(const std::string& path)
 {
     auto fail = [&path](const std::string& why) -> VolumeFile {
@@ -93,7 +93,7 @@ inline VolumeFile parseVolumeName(const std::string& path)
 }
 
 // Checks that the stream of file.data is as long as it must be, and finds where the voxels begin. Throws
-// std::runtime_error that names the file, the expected and the found.
+// std::runtime_error that names the file, what was expected and what was found.
 inline void findVoxels(std::istream& stream, VolumeFile& file)
 {
     const std::string where = file.path + (file.data == file.path ? "" : ": " + file.data);

@@ -1,4 +1,4 @@
-// VolumeLook: in which colours a volume is shown, over which values, and its isosurfaces.
+// VolumeLook: the colours and opacities of a volume, the range of values that they cover, and its isosurfaces.
 #pragma once
 
 #include "transfer_function.hpp"
@@ -15,8 +15,8 @@ struct VolumeLook {
     std::vector<float> isovalues;    // of the data, ascending
     std::vector<Vec3> isoColors;     // of each, linear RGB
     std::optional<float> isoOpacity; // none: that of the run's surfaces
-    float standsOutFrom = 0.006f;    // the opacity of what a camera has to show
-    bool isTomography = false;       // of a body, as far as the values tell
+    float standsOutFrom = 0.006f;    // the camera has to show more opaque values
+    bool isTomography = false;       // its values look like those of a body
 
     float scale() const { return 1 / (hi - lo); }
     bool hasIsovalueIn(float least, float greatest) const

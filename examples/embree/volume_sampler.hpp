@@ -35,7 +35,7 @@ public:
         dispatch([this](const auto* voxels) { buildSkipGrid(voxels); });
     }
 
-    // Of a rotated volume right to a quarter of a voxel, as floats are rounded.
+    // Converts a point to voxel indices; for a rotated volume only to a quarter of a voxel, because floats are rounded.
     Vec3 toVoxel(const Vec3& world) const
     {
         if (!volume_.rotation.isNone()) {
@@ -56,7 +56,7 @@ public:
         return {1 / along.x * scale.x / step, 1 / along.y * scale.y / step, 1 / along.z * scale.z / step};
     }
 
-    // The domain in world space, for clipping rays with some slack; who is inside is decided by inDomain().
+    // The domain in world space, for clipping rays with some slack; inDomain() decides which points are inside.
     Box bounds() const
     {
         Box box;
@@ -90,7 +90,7 @@ public:
                         at.fz);
         });
     }
-    // Where the values rise, in the world; of length 1 or 0. For a point in the cell.
+    // The direction in the world in which the values rise; of length 1 or 0. For a point in the cell.
     Vec3 directionAt(const Vec3& v) const
     {
         return dispatch([&](const auto* voxels) {
@@ -130,7 +130,7 @@ private:
     static constexpr int cellShift = 3, cellWidth = 1 << cellShift; // of the skip grid, in voxels
     static_assert(cellWidth == skipWidth);
 
-    // Makes toVoxel() one of the rotated volume.
+    // Prepares toVoxel() for a rotated volume.
     void turnAxes()
     {
         for (int i = 0; i < 3; ++i) {
@@ -148,7 +148,7 @@ private:
     }
 
     float last(int axis) const { return static_cast<float>(info().dims[static_cast<std::size_t>(axis)] - 1); }
-    // In units of 1/256 of the volume's largest extent.
+    // Converts a step to units of 1/256 of the volume's largest extent.
     float stepIn256ths(float step) const
     {
         int largest = 0;
@@ -216,7 +216,7 @@ private:
         const Vec3 gradient = gradientOf(at, z0, z1);
         const float steepness = length(gradient);
         if (steepness > 0) {
-            // Where the value hardly changes its direction is noise: there the colour is left as it is.
+            // Where the value hardly changes, the direction of the gradient is noise, so the colour is left as it is.
             const Vec3 normal = inWorld(gradient * (1 / steepness));
             const float weight = std::min(1.0f, 25.0f * steepness);
             const float lit = 1 + weight * (light.diffuse(normal) - 1);
@@ -238,8 +238,8 @@ private:
                + static_cast<std::size_t>(x);
     }
 
-    // distances_: number of cells to the nearest that has something to see, diagonals counting as one; all cells
-    // closer than that can be skipped at once.
+    // Fills distances_: for each cell the number of cells to the nearest visible one, with diagonals counting as one.
+    // All cells closer than that can be skipped at once.
     template <class T>
     void buildSkipGrid(const T* voxels)
     {
@@ -270,7 +270,7 @@ private:
                                  && !look().hasIsovalueIn(static_cast<float>(least), static_cast<float>(greatest));
             distances_[cellIndex(x, y, z)] = isEmpty ? 255 : 0;
         });
-        // Two sweeps, each over the neighbours that it has already been to, give the exact distance.
+        // Two sweeps, each of which looks at the neighbours that it has visited already, give the exact distance.
         for (const int direction : {1, -1})
             forEachCell(direction, [&](int x, int y, int z) {
                 int distance = distances_[cellIndex(x, y, z)];

@@ -15,7 +15,7 @@ public:
     {
         const std::size_t size = voxelBytes(info_.type);
         bytes_.resize(nxy_ * static_cast<std::size_t>(hi[2] - lo[2]) * size);
-        // What the volume has of it, or is nearest to it, in slabs of some MB.
+        // Reads the voxels of the volume that are in the block, or nearest to it, in slabs of some MB.
         Index3 first, behind;
         for (std::size_t axis = 0; axis < 3; ++axis) {
             first[axis] = std::clamp(lo[axis], 0, info_.dims[axis] - 1);
@@ -56,7 +56,7 @@ public:
     std::size_t rowStride() const { return nx_; }
     std::size_t sliceStride() const { return nxy_; }
 
-    // Of a voxel by its index in the whole volume.
+    // The index of a voxel in the block, from its index in the whole volume.
     std::size_t index(int x, int y, int z) const
     {
         return static_cast<std::size_t>(z - lo_[2]) * nxy_ + static_cast<std::size_t>(y - lo_[1]) * nx_

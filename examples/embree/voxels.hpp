@@ -18,7 +18,8 @@
 
 namespace example {
 
-// In memory. Each has all values of the file's type, but that of 32-bit integers and doubles the nearest float is kept.
+// Types in memory. Each has all values of the file's type, except that 32-bit integers and doubles become the nearest
+// float.
 enum class VoxelType { UInt8, UInt16, Float32, Int16 };
 
 // Calls `function` with a value of the type.
@@ -38,7 +39,7 @@ inline std::size_t voxelBytes(VoxelType type)
     return withVoxelType(type, [](auto voxel) { return sizeof voxel; });
 }
 
-// In a file.
+// Types in a file.
 enum class FileType { UInt8, Int8, UInt16, Int16, UInt32, Int32, Float32, Float64 };
 
 // The name of each, as in the names of .raw files.
@@ -93,7 +94,7 @@ struct VoxelFormat {
         return bytes() == voxelBytes(inMemory()) && (bytes() == 1 || !isBigEndian) && type != FileType::UInt32
                && type != FileType::Int32;
     }
-    // From the bytes of the file to those in memory, which are elsewhere.
+    // Converts bytes of the file to voxels in memory. The two must not overlap.
     void convert(const std::byte* from, std::size_t count, std::byte* to) const
     {
         withFileType(type, [&](auto voxel) {
@@ -115,7 +116,7 @@ private:
     template <class Kept, class Voxel>
     static Kept as(Voxel voxel)
     {
-        if constexpr (sizeof(Voxel) > sizeof(float)) // doubles that no float has are infinite
+        if constexpr (sizeof(Voxel) > sizeof(float)) // doubles beyond the range of floats become infinite
             if (std::fabs(voxel) > static_cast<Voxel>(std::numeric_limits<float>::max()))
                 return static_cast<Kept>(std::copysign(std::numeric_limits<float>::infinity(), voxel));
         return static_cast<Kept>(voxel);

@@ -21,7 +21,7 @@ namespace example {
 
 namespace detail {
 
-// Which columns of a line have the element, and from which on they have the place.
+// The column of a line that has the element, and the first of the three that have the position.
 struct XyzColumns {
     int symbol = 0, place = 1;
 
@@ -59,7 +59,7 @@ struct XyzColumns {
             throw std::runtime_error("expected species:S:1 and pos:R:3 among the Properties in the comment");
     }
 
-    // False if the line is none of an atom. `word` is what its element is called.
+    // Returns false if the line is not that of an atom. Sets `word` to what the line calls the element.
     bool parse(std::string_view line, Sphere& sphere, std::string_view& word) const
     {
         Vec3d at;
@@ -137,7 +137,7 @@ class XyzReader {
 public:
     XyzReader(std::string_view bytes, const std::string& name) : size_(bytes.size()), lines_(bytes), name_(name) {}
 
-    // The lines of count and comment. False if there are no more frames; `number` is that of this one.
+    // Reads the lines of count and comment of frame `number`. Returns false if there are no more frames.
     bool beginFrame(int number)
     {
         std::string_view line, word;
@@ -207,11 +207,11 @@ private:
 
 } // namespace detail
 
-// Frames of a line with the count, a line of comment, and a line `element x y z` per sphere, in Angstrom; what else is
-// in a line is skipped. Elements are symbols, in upper or lower case, or numbers. In extended XYZ the comment says
-// which columns these are. Takes the frame of this number, from 1; 0: the first, and if there are more, `notes` says
-// so. Throws std::runtime_error with `name`, what was expected and what was found. `notes` gets unknown elements, too,
-// if not null.
+// Reads frames. Each has a line with the count, a line of comment, and a line `element x y z` per sphere, in Angstrom;
+// anything else in a line is skipped. Elements are symbols, in upper or lower case, or numbers. In extended XYZ the
+// comment says which columns these are. Takes the frame of this number, from 1; 0: the first, and if there are more,
+// `notes` says so. Throws std::runtime_error with `name`, what was expected and what was found. `notes` gets unknown
+// elements, too, if not null.
 inline std::vector<Sphere> parseXyz(std::string_view bytes, const std::string& name, int frame = 0,
                                     Notes* notes = nullptr)
 {

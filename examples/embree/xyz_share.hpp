@@ -11,7 +11,7 @@ class XyzShares {
 public:
     explicit XyzShares(const std::string& path, const Loaders& loaders) : path_(path), loaders_(loaders) {}
 
-    // The frame of this number, from 1, or nothing. Adds to `isOneOfMore` whether another follows.
+    // Reads frame number `wanted`, from 1; returns nothing if that fails. Sets `isOneOfMore` if another frame follows.
     std::optional<SphereShare> read(int wanted, bool& isOneOfMore, UnknownElements& unknown)
     {
         std::uint64_t lines = 0;
@@ -52,19 +52,19 @@ public:
 private:
     static constexpr std::uint64_t none = std::numeric_limits<std::uint64_t>::max();
 
-    // The number of atoms, on which line; 0: it is none.
+    // A line with the number of atoms. A count of 0: the line has no number.
     struct Header {
         std::uint64_t line = none, count = 0;
     };
 
-    // This rank's lines from a line on, without those before.
+    // Skips this rank's lines before that line.
     void goTo(std::uint64_t line)
     {
         for (; next_ < line && !left_.atEnd(); ++next_)
             left_.next();
     }
 
-    // Collective: on that line, or on the first after it that is not empty.
+    // Collective: the header on that line, or on the first line after it that is not empty.
     Header headerAt(std::uint64_t at, bool isThere)
     {
         const std::vector<Header> found = loaders_.gatherOf<Header>([&] {
@@ -89,7 +89,7 @@ private:
         return first;
     }
 
-    // Collective: what the comment on that line says. False if it is wrong.
+    // Collective: takes the columns from the comment on that line. Returns false if it is wrong.
     bool columnsAt(std::uint64_t at, XyzColumns& columns)
     {
         const std::vector<XyzColumns> found = loaders_.gatherOf<XyzColumns>([&] {
@@ -100,7 +100,7 @@ private:
                 try {
                     TextLines lines = left_;
                     own.back() = XyzColumns(lines.next());
-                } catch (const std::runtime_error&) { // said by who reads all of it
+                } catch (const std::runtime_error&) { // the reader of the whole file reports it
                     own.back().symbol = -1;
                 }
             }
@@ -136,8 +136,8 @@ private:
 
 } // namespace detail
 
-// Collective: what parseXyz() makes of a file, of which each rank reads a share of the lines. Nothing, on all ranks, if
-// anything is not as it should be: parseXyz() of the whole says what.
+// Collective: the same as parseXyz(), but each rank reads a share of the lines. Returns nothing, on all ranks, if
+// anything is wrong; parseXyz() of the whole file then says what.
 inline std::optional<SphereShare> readXyzShare(const std::string& path, int frame, const Loaders& loaders, Notes* notes)
 {
     bool isOneOfMore = false;
