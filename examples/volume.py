@@ -9,7 +9,7 @@ import numpy as np
 
 import dfb
 
-BRICKS, STEP = 3, 1 / 90  # bricks a side, of a cube from -1 to 1; length of a step along a ray
+BRICKS, STEP = 3, 1 / 90  # bricks along each side of a cube from -1 to 1; length of a step along a ray
 CAMERA = dfb.PerspectiveCamera(eye=(2.6, 1.9, 3.1), target=(0, -0.05, 0), fov_y=32)
 LIGHT = np.array((0.2, 0.9, 0.35))
 
@@ -29,7 +29,7 @@ def draw(brick, tile):
     y, x = np.nonzero(near < far)  # the rays that meet the brick
     origins, directions, near, far = origins[y, x], directions[y, x], near[y, x], far[y, x]
     color, through = np.zeros((len(x), 3)), np.ones(len(x))  # through: the part of the light behind that is seen
-    # Steps are at the same places in all bricks, so that there is no seam between them.
+    # Steps are at the same distances from the eye in all bricks, so that there are no seams.
     for step in range(int(near.min(initial=9) / STEP), int(far.max(initial=0) / STEP) + 1):
         t = (step + 0.5) * STEP
         points = origins + t * directions

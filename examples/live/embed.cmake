@@ -1,5 +1,5 @@
 # Run with: cmake -DIN=<file> -DOUT=<.cpp> -P embed.cmake
-# Makes the file a string of the program.
+# Makes a C++ source that has the file as a string.
 file(READ ${IN} text)
 # Compilers need not take a literal of more than 65536 characters; adjacent ones are one.
 string(LENGTH "${text}" length)

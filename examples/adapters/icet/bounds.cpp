@@ -1,4 +1,4 @@
-// Where this rank has pixels: its vertices as the matrices project them onto the wall, and its share of them if other
+// Finds where this rank has pixels: where the matrices project its vertices on the wall, or its share of that if other
 // ranks have the same data.
 #include "context.hpp"
 
@@ -36,7 +36,7 @@ struct Box {
         nearest = std::fmin(nearest, z), farthest = std::fmax(farthest, z);
     }
 
-    // The pixels of the wall that it touches.
+    // The pixels of the wall that the box touches.
     Region pixels(const Region& wall) const
     {
         const auto pixel = [](double value, int first, int end) {
@@ -49,10 +49,10 @@ struct Box {
     }
 };
 
-// Points nearer than the near plane are not seen. The point where an edge goes through that plane is.
+// Points in front of the near plane are not visible. Where an edge crosses that plane, the crossing point counts.
 Box project(const std::vector<Vector>& clip, const Region& wall)
 {
-    const auto before = [](const Vector& v) { return v[2] + v[3]; }; // the near plane: 0 there
+    const auto before = [](const Vector& v) { return v[2] + v[3]; }; // 0 on the near plane
     Box box;
     for (const Vector& v : clip) {
         if (before(v) >= 0) {
@@ -90,7 +90,8 @@ Region strip(const Region& all, std::size_t index, std::size_t count)
     return {all.x0 + edge(index), all.y0, all.x0 + edge(index + 1), all.y1};
 }
 
-// The tile that each rank renders, by rank: a rank that displays one takes it, the others take turns. -1: none.
+// The tile that each rank renders, by rank. A rank that displays one of the tiles takes it; the others share the rest
+// in turn. -1: none.
 std::vector<int> tilesOfReplicas(const std::vector<int>& ranks, std::vector<int> tiles, const Settings& settings)
 {
     std::vector<int> taken(ranks.size(), -1);
@@ -108,8 +109,8 @@ std::vector<int> tilesOfReplicas(const std::vector<int>& ranks, std::vector<int>
     return taken;
 }
 
-// Leaves this rank the part of the frame that it renders, of the ranks that have the same data: no pixel of a tile
-// comes from two of them.
+// Shares out a frame among the ranks that have the same data, and leaves this rank its part. No pixel of a tile comes
+// from two of them.
 void share(const IceTContextStruct& context, Frame& frame)
 {
     const std::vector<int>& ranks = context.replicas;

@@ -1,4 +1,4 @@
-// The functions here that IceTMPI.h and IceTGL.h declare, and the communicator of MPI in one of IceT.
+// The functions of this library that IceTMPI.h and IceTGL.h declare, and the MPI communicator of one of IceT.
 #pragma once
 
 #include <IceT.h>

@@ -1,5 +1,5 @@
-// Frames: the images of all ranks become the pictures of the tiles. And icetCompositeImage, for images that the client
-// has rendered already.
+// Frames, which make the pictures of the tiles from the images of all ranks; and icetCompositeImage, for images that
+// the client has rendered already.
 #include "context.hpp"
 #include "errors.hpp"
 
@@ -20,7 +20,7 @@ constexpr float nothing = std::numeric_limits<float>::infinity(); // the depth w
 struct Plan {
     dfb::ImageBlend blend = dfb::ImageBlend::Nearest;
     dfb::OutputFormat format = dfb::OutputFormat::RGBA8;
-    std::array<float, 4> background{}; // that the library lays below
+    std::array<float, 4> background{}; // that the library puts below the images
     bool givesDepth = false;           // to the client
     bool fillsBackground = false;      // where no rank has a depth, afterwards
     int place = -1;                    // of this rank, from the front
@@ -36,7 +36,7 @@ std::array<float, 4> backgroundOf(const IceTContextStruct& context)
     return color;
 }
 
-// Throws Error if the client's settings make no picture.
+// Throws Error if no picture can be made with the client's settings.
 Plan planOf(const IceTContextStruct& context)
 {
     const Settings& s = context.settings;
@@ -123,7 +123,7 @@ void takeColor(Image& to, const dfb::Image& picture, const IceTContextStruct& co
     }
 }
 
-// Makes a picture the result of this context, with IceT's depth of nothing, which is 1.
+// Makes a picture the result of this context. Where there is nothing, its depth is 1, as in IceT.
 IceTImage present(IceTContextStruct& context, const dfb::Image& picture, const Plan& plan)
 {
     Image& to = context.result;
@@ -157,7 +157,7 @@ std::vector<dfb::ImageCompositor*> picturesOf(IceTContextStruct& context, const 
 void start(dfb::ImageCompositor& picture, const Source& source, int tile, const Plan& plan, std::int64_t number)
 {
     dfb::FrameConfig frame;
-    frame.accumulationId = static_cast<std::uint64_t>(number); // ranks that have made different calls are an error
+    frame.accumulationId = static_cast<std::uint64_t>(number); // so it is an error if ranks have made different calls
     frame.background = plan.background;
     frame.timeout = timeLimit();
     dfb::InputImage input;
@@ -170,7 +170,7 @@ void start(dfb::ImageCompositor& picture, const Source& source, int tile, const 
     picture.start(input, plan.place, frame);
 }
 
-// Ends all of them, then throws what the first has thrown, if any has.
+// Ends all pictures, then throws the first exception of any of them.
 void end(const std::vector<dfb::ImageCompositor*>& pictures, Frame& frame)
 {
     std::exception_ptr failure;
@@ -255,7 +255,7 @@ dfb::InputImage inputOf(IceTContextStruct& context, const Image& image, const Re
         return {};
     dfb::InputImage input;
     if (image.colorFormat == ICET_IMAGE_COLOR_NONE)
-        input.rgba8 = reinterpret_cast<const std::uint8_t*>(image.depth); // any colour: nobody will see it
+        input.rgba8 = reinterpret_cast<const std::uint8_t*>(image.depth); // any colour, as it is not shown
     else if (!image.color)
         throw Error(ICET_INVALID_VALUE, "an image without colors");
     else if (image.colorFormat == ICET_IMAGE_COLOR_RGBA_UBYTE)

@@ -16,7 +16,7 @@ namespace {
 
 IceTContext current = nullptr;
 
-// The colour of each rank. Waits without keeping the core from a rank that has to come yet.
+// Returns the colour of each rank. While it waits, it yields the core to ranks that have not called yet.
 std::vector<int> gatherColors(const IceTContextStruct& context, int color)
 {
     struct Gather {
@@ -35,7 +35,7 @@ std::vector<int> gatherColors(const IceTContextStruct& context, int color)
     return gather->all;
 }
 
-// Contexts that are there, in the order in which they were made, which is the same on all ranks.
+// All existing contexts, in the order in which they were made, which is the same on all ranks.
 std::vector<IceTContext> contexts;
 
 void requireThere(IceTContext context)
@@ -44,7 +44,7 @@ void requireThere(IceTContext context)
         throw Error(ICET_INVALID_VALUE, "there is no such context");
 }
 
-// MPI_Finalize() begins with this: a client may forget its contexts, and they have messages under way.
+// MPI_Finalize() calls this first, because a client may forget its contexts, which have messages under way.
 int closeAll(MPI_Comm, int, void*, void*)
 {
     for (const IceTContext context : contexts)
@@ -68,7 +68,7 @@ void closeBeforeMpiEnds(IceTContext context)
 void forget(IceTContext context) { contexts.erase(std::find(contexts.begin(), contexts.end(), context)); }
 
 // Only the client's own thread calls MPI, at every thread level: all ranks composite at the same time anyway, and a
-// client may forget its contexts. MPICH does not lock any more when MPI_Finalize() has begun.
+// client may forget its contexts. MPICH no longer locks once MPI_Finalize() has begun.
 std::shared_ptr<dfb::Connection> connectRanks(MPI_Comm communicator)
 {
     dfb::NetworkConfig network;
@@ -76,7 +76,7 @@ std::shared_ptr<dfb::Connection> connectRanks(MPI_Comm communicator)
     return dfb::connect(communicator, network);
 }
 
-// A rank that has one processor composites where it waits, and makes no threads.
+// A rank with one processor composites in the thread that waits, and makes no threads.
 std::shared_ptr<dfb::Executor> makeExecutor(const dfb::Connection& connection)
 {
     if (connection.threadShare() == 1)

@@ -41,7 +41,7 @@ struct Settings {
     std::array<bool, ICET_STATE_ENABLE_END - ICET_STATE_ENABLE_START> enabled{};
 };
 
-// A frame: what it was called with, and what came out.
+// A frame: the arguments of its call, and its results.
 struct Frame {
     std::int64_t count = 0; // of this context
     bool isPreRendered = false;
@@ -49,10 +49,10 @@ struct Frame {
     std::array<float, 4> background{};
     Region contained;                  // the part of the wall that this rank has pixels in
     double nearest = 1, farthest = -1; // of the vertices, as normalised depth
-    std::vector<int> tiles;            // that `contained` touches
+    std::vector<int> tiles;            // the tiles that `contained` touches
     double renderSeconds = 0, totalSeconds = 0;
     std::int64_t bytesSent = 0;                    // by all ranks
-    std::int64_t tilesTouched = 0, tilesTotal = 0; // of the library's small ones
+    std::int64_t tilesTouched = 0, tilesTotal = 0; // small tiles of the library
 };
 
 // The pictures of a context's tiles. Those that frames need again are kept.
@@ -65,8 +65,8 @@ public:
         bool depth = false;
     };
 
-    // Drops what has not been used for long. Collective; to be called with the number of the context's next frame, as
-    // is the next, in the same order on all ranks.
+    // Drops pictures that have not been used for long. Call it with the number of the context's next frame. This and
+    // find() are collective: all ranks make the same calls in the same order.
     void newFrame(std::int64_t frame);
     dfb::ImageCompositor& find(const Key& key, const IceTContextStruct& context);
     void clear() { entries_.clear(); }
@@ -81,14 +81,14 @@ private:
     std::int64_t frame_ = 0;
 };
 
-// Matrices and background that a client gives with a frame. Null matrices: none.
+// Matrices and background that a client gives with a frame. Pointers to matrices may be null.
 struct View {
     const IceTDouble *projection, *modelview;
     const IceTFloat* background;
 };
 
-// Where this rank's pixels come from: the part of the wall outside of which there are none, if it is known, and the
-// input of each tile. An exception fails the frame on all ranks.
+// Where this rank's pixels come from: `limits`, if not null, is the part of the wall outside of which there are none;
+// `input` returns the input of a tile. An exception fails the frame on all ranks.
 struct Source {
     bool isPreRendered = false;
     const Region* limits = nullptr;
@@ -98,7 +98,7 @@ struct Source {
 // Makes a frame and returns the picture of this rank's tile, if it displays one. Collective.
 IceTImage makeFrame(IceTContextStruct& context, const View& view, const Source& source);
 
-// Finds Frame::contained and Frame::tiles: where the vertices are on the wall, and within `limits`, if given.
+// Finds Frame::contained and Frame::tiles: the part of the wall that the vertices cover, within `limits` if not null.
 void findContained(IceTContextStruct& context, const Region* limits);
 
 // The pixels of an image that shows the part `memory` of the wall, of which `part` is valid, as input of a tile.
@@ -116,7 +116,7 @@ struct IceTContextStruct {
     // Collective over `communicator`, as are the next two.
     explicit IceTContextStruct(MPI_Comm communicator);
     ~IceTContextStruct();
-    // Leaves MPI, which is about to end. Frames are errors then.
+    // Leaves MPI, which is about to end. Every later frame is an error.
     void close();
 
     int rank() const noexcept { return ownRank; }
@@ -132,6 +132,6 @@ struct IceTContextStruct {
     bool hasGl = false, isDrawing = false;
     dfb_icet::Frame frame;
     dfb_icet::Pictures pictures;
-    dfb_icet::Image rendered, result; // of the draw callback, and of the last frame
-    std::vector<float> withAlpha;     // an RGB image as the library wants it
+    dfb_icet::Image rendered, result; // images of the draw callback, and of the last frame
+    std::vector<float> withAlpha;     // an RGB image with the alpha that the library needs
 };

@@ -13,8 +13,8 @@ using Matrix = std::array<double, 16>;
 // The part of the wall that the client renders for a tile, and what is read of it.
 struct Window {
     Region shown;        // as large as icetPhysicalRenderSize() says
-    Region part;         // of the wall: what is read
-    bool floats = false; // it shows all that this rank has, for all tiles
+    Region part;         // the part of the wall that is read
+    bool floats = false; // it shows everything of this rank, for all tiles
 };
 
 Window windowFor(const IceTContextStruct& context, const Region& tile)
@@ -28,7 +28,7 @@ Window windowFor(const IceTContextStruct& context, const Region& tile)
     return {viewport(tile.x0, tile.y0, width, height), intersection(tile, all), false};
 }
 
-// `projection` for a window on the wall.
+// Changes `projection` to that of a window on the wall.
 Matrix project(const Matrix& projection, const Region& wall, const Region& window)
 {
     const double scale[2] = {double(wall.width()) / window.width(), double(wall.height()) / window.height()};
@@ -60,7 +60,7 @@ void prepare(IceTContextStruct& context)
     image.depth = depth > 0 ? reinterpret_cast<float*>(image.shared.data() + image.pixelCount() * color) : nullptr;
 }
 
-// `read`: in the window; empty if its pixels are not wanted.
+// Calls the client's draw callback. `read` is in coordinates of the window; empty if no pixels are needed.
 void callBack(IceTContextStruct& context, const Region& window, const Region& read)
 {
     Frame& frame = context.frame;
@@ -95,7 +95,7 @@ public:
             render(window.shown, read, window.floats);
         dfb::InputImage input = inputOf(context_, context_.rendered, window.shown, window.part, tile);
         input.staysUntilEnd =
-            input.staysUntilEnd && context_.settings.tiles.size() == 1; // or others are rendered there
+            input.staysUntilEnd && context_.settings.tiles.size() == 1; // otherwise the next tile is rendered there
         return input;
     }
 
@@ -108,7 +108,7 @@ private:
     }
 
     IceTContextStruct& context_;
-    bool hasFloated_ = false; // what it shows is still there
+    bool hasFloated_ = false; // the image of all tiles is still in memory
 };
 
 } // namespace

@@ -9,7 +9,8 @@ namespace dfb_icet {
 
 namespace {
 
-// Of all contexts, as with IceT: the first since icetGetError(), or the first error after warnings.
+// The kept error, in common for all contexts as in IceT: the first one since icetGetError(), or the first error after
+// warnings.
 IceTEnum keptType = ICET_NO_ERROR, keptLevel = 0;
 
 IceTEnum typeOf(const std::exception& error)
@@ -26,7 +27,7 @@ const char* nameOf(IceTEnum level)
     return level == ICET_DIAG_ERRORS ? "ERROR" : level == ICET_DIAG_WARNINGS ? "WARNING" : "DEBUG";
 }
 
-// Each level has the bits of those above it.
+// Each level contains the bits of the more severe ones.
 void print(IceTEnum level, const std::string& text)
 {
     const IceTContextStruct* context = icetGetContext();

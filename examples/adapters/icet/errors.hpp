@@ -18,7 +18,8 @@ public:
     IceTEnum type;
 };
 
-// Each reports one, by the diagnostics of the current context; without a context it prints all but debug messages.
+// Each reports an error, a warning or a message, as the diagnostics of the current context say. Without a context, all
+// except debug messages are printed.
 void raiseError(const char* function, const std::exception& error);
 void raiseWarning(const char* function, IceTEnum type, const std::string& text);
 void sayDebug(const std::string& text);
@@ -40,7 +41,7 @@ auto guarded(const char* function, const Body& body) -> decltype(body())
     return decltype(body())();
 }
 
-// Calls body(context) with the current context in this way.
+// Calls body(context) in the same way, with the current context.
 template <class Body>
 void inContext(const char* function, const Body& body)
 {

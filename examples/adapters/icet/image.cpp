@@ -97,7 +97,7 @@ Image& withDepth(IceTImage image)
     return *imageOf(image);
 }
 
-// As IceT does it: to the level below.
+// Rounds down to a level, as IceT does.
 IceTUByte levelOf(float value) { return static_cast<IceTUByte>(255 * std::clamp(value, 0.0f, 1.0f)); }
 
 void copyBytes(const IceTImage image, IceTUByte* out, IceTEnum format)

@@ -10,33 +10,33 @@
 
 namespace dfb_icet {
 
-// Of a pixel. Throw Error if there is no such format.
+// Bytes of a pixel. Throw Error if there is no such format.
 std::size_t colorBytes(IceTEnum format);
 std::size_t depthBytes(IceTEnum format);
 
 struct Image {
     IceTEnum colorFormat = ICET_IMAGE_COLOR_NONE, depthFormat = ICET_IMAGE_DEPTH_NONE;
     int width = 0, height = 0;
-    const void* color = nullptr; // in one of these memories, or in a picture of the library's
+    const void* color = nullptr; // in `shared` or `owned`, or in a picture of the library
     const float* depth = nullptr;
-    dfb::Buffer shared;           // what the draw callback renders into; ranks of the node read it there
-    std::vector<std::byte> owned; // copies of what the library has
+    dfb::Buffer shared;           // the draw callback renders into it; ranks of the node read it there
+    std::vector<std::byte> owned; // copies of the library's pixels
     std::vector<float> ownedDepth;
 
     std::size_t pixelCount() const noexcept
     {
         return static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
     }
-    // Colours that a client may change. The library's are copied first: its pictures keep a background from frame to
-    // frame.
+    // Colours that a client may change. Those in a picture of the library are copied first, because its pictures keep
+    // their background from frame to frame.
     void* writableColor();
-    // Makes the colours its own, in `bytes` bytes, and returns them.
+    // Makes `owned`, with `bytes` bytes, the memory of the colours, and returns it.
     std::byte* ownColor(std::size_t bytes);
 };
 
 // Returns the part of an image of RGB floats as RGBA with alpha 1, in `memory`, which gets the size of the image.
 const float* addAlpha(const float* rgb, const dfb::Region& part, int width, int height, std::vector<float>& memory);
-// `out` may be where `rgba` is.
+// `out` may be the same memory as `rgba`.
 void dropAlpha(const float* rgba, std::size_t pixels, float* out);
 
 } // namespace dfb_icet

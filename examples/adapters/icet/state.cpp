@@ -12,7 +12,7 @@ namespace dfb_icet {
 
 namespace {
 
-// The numbers of a state; a double has all of IceT's integers.
+// The numbers of a state. A double holds all integers of IceT exactly.
 using Values = std::vector<double>;
 
 Values of(const Region& v) { return {double(v.x0), double(v.y0), double(v.width()), double(v.height())}; }
@@ -33,7 +33,7 @@ Values numbers(const Range& range)
     return each(range, [](const auto& number) { return Values{double(number)}; });
 }
 
-// Bytes as they lie in memory, as an integer.
+// The bytes of a colour, as they are in memory, as an integer.
 double wordOf(const std::array<float, 4>& color)
 {
     std::uint8_t bytes[4];
@@ -144,7 +144,7 @@ Values valuesOfFrame(const IceTContextStruct& c, IceTEnum name)
     }
 }
 
-// A list may be empty; these are.
+// Whether a state is a list, which may be empty.
 bool isList(IceTEnum name)
 {
     static const std::set<IceTEnum> lists{ICET_TILE_VIEWPORTS, ICET_DISPLAY_NODES, ICET_GEOMETRY_BOUNDS,
@@ -179,7 +179,7 @@ void set(const char* function, IceTEnum option, bool value)
     });
 }
 
-// Sets one value, which has to be one of those that are possible.
+// Sets one value, which must be one of `possible`.
 void choose(const char* function, IceTEnum Settings::*setting, IceTEnum value, const std::set<IceTEnum>& possible)
 {
     inContext(function, [&](IceTContextStruct& context) {

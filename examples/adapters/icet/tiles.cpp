@@ -44,7 +44,7 @@ double numberAt(const unsigned char* at)
     return static_cast<double>(number);
 }
 
-// A number of the type, and how many bytes it has.
+// How to read a number of a type, and its size in bytes.
 struct NumberType {
     double (*read)(const unsigned char*);
     std::size_t bytes;

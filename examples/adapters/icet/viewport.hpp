@@ -1,4 +1,4 @@
-// Viewports: rectangles of pixels, which IceT has from their lower left corner, as regions of the library.
+// Viewports: rectangles of pixels, which IceT gives by their lower left corner, as regions of the library.
 #pragma once
 
 #include <dfb/image.hpp>
@@ -12,7 +12,7 @@ using dfb::Region;
 
 inline Region viewport(int x, int y, int width, int height) noexcept { return {x, y, x + width, y + height}; }
 
-// The smallest that has both, of which `a` may be empty.
+// The smallest region that contains both; `a` may be empty.
 inline Region hull(const Region& a, const Region& b) noexcept
 {
     if (a.empty())
@@ -20,7 +20,7 @@ inline Region hull(const Region& a, const Region& b) noexcept
     return {std::min(a.x0, b.x0), std::min(a.y0, b.y0), std::max(a.x1, b.x1), std::max(a.y1, b.y1)};
 }
 
-// `part` as a picture of `tile` has it. Rows of both count upwards, so no picture is turned.
+// `part` in coordinates of the picture of `tile`. Rows of both count upwards, so no picture is flipped.
 inline Region regionIn(const Region& tile, const Region& part) noexcept
 {
     return viewport(part.x0 - tile.x0, part.y0 - tile.y0, part.width(), part.height());

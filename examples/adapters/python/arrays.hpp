@@ -1,4 +1,4 @@
-// InputArrays: arrays of numpy as the InputImage of a rank, in place.
+// InputArrays: an InputImage on the memory of numpy arrays, without a copy.
 #pragma once
 
 #include "errors.hpp"
@@ -22,13 +22,13 @@ namespace dfb_python {
 
 inline std::string shapeOf(const py::array& array) { return py::str(array.attr("shape")); }
 
-// Where the pixels of an array are: rows whose pixels lie one after another.
+// Where the pixels of an array are: rows in which the pixels are contiguous.
 struct ArrayRows {
     const void* first = nullptr; // the lowest address
     std::ptrdiff_t rowPixels = 0;
     bool isFlipped = false; // the array's first row is the last in memory, as of array[::-1]
 
-    // `channels`: of a pixel. Throws InvalidArgument if they do not lie so.
+    // `channels`: those of a pixel. Throws InvalidArgument if the array has another layout.
     ArrayRows(const py::array& array, int channels, const std::string& name)
     {
         const py::ssize_t height = array.shape(0), width = array.shape(1), pixel = channels * array.itemsize();
@@ -51,7 +51,7 @@ struct ArrayRows {
 // The arguments of a call of composite(), as the library takes them. The arrays must outlive it.
 class InputArrays {
 public:
-    // With the GIL. Throws InvalidArgument for arrays that cannot be, and exceptions of Python.
+    // With the GIL. Throws InvalidArgument for wrong arrays, and exceptions of Python.
     void read(const py::object& rgba, const py::object& depth, const py::dict& options, const dfb::ImageConfig& picture)
     {
         image.bottomUp = argument<bool>(options, "bottom_up", "a bool");
@@ -119,7 +119,7 @@ private:
             throw dfb::InvalidArgument("rgba has " + std::to_string(width) + "x" + std::to_string(height)
                                        + " pixels, the picture " + std::to_string(picture.width) + "x"
                                        + std::to_string(picture.height) + ": give origin=(x, y) for a part of it");
-        // No farther outside than that all sums fit.
+        // So near to the picture that no sum overflows.
         const int most = 1 << 24;
         if (std::max(std::abs(origin[0]), std::abs(origin[1])) > most || std::max(width, height) > most)
             throw dfb::InvalidArgument("rgba is farther outside of the picture than can be");
@@ -137,7 +137,7 @@ private:
         const std::ptrdiff_t height = depths.shape(0), width = depths.shape(1);
         if (height == 1 || (own.rowPixels == rows.rowPixels && own.isFlipped == rows.isFlipped))
             return;
-        // The library reads both by one distance of rows.
+        // The library uses one row distance for colour and depth.
         copiedDepth_.resize(static_cast<std::size_t>(rows.rowPixels * (height - 1) + width));
         for (std::ptrdiff_t y = 0; y < height; ++y) {
             const std::ptrdiff_t from = own.isFlipped == rows.isFlipped ? y : height - 1 - y;

@@ -1,4 +1,4 @@
-// Collective: an object of the library with an image, whose construction, calls and end are collective.
+// Collective: an object of the library that has an image. Its construction, calls and destruction are collective.
 #pragma once
 
 #include "errors.hpp"
@@ -20,8 +20,8 @@
 
 namespace dfb_python {
 
-// `Object`: dfb::ImageCompositor, or a class with such members. All members with the GIL, which they release while they
-// wait.
+// `Object`: dfb::ImageCompositor, or a class with the same members. Members are called with the GIL, and release it
+// while they wait.
 template <class Object>
 class Collective {
 public:
@@ -61,7 +61,7 @@ public:
         const Use use(*this);
         const bool hasArrays = views_->any();
         py::detail::make_caster<std::array<int, 2>> size;
-        std::array<int, 2> to{1, 1}; // is refused on all ranks if there is a veto
+        std::array<int, 2> to{1, 1}; // not used if there is a veto: then all ranks refuse
         if (hasArrays)
             veto_.set("there are arrays of the image, so it cannot get another size: delete them, or take copies");
         else if (size.load(py::make_tuple(width, height), true))
@@ -80,7 +80,7 @@ public:
         }
     }
 
-    // Arrays of the image stay as they are.
+    // Arrays of the image stay valid.
     void close()
     {
         if (!object_)
@@ -91,8 +91,8 @@ public:
         object_.reset();
     }
 
-    // In place of close() on a rank that leaves because of an exception: the others may never come to their end. They
-    // get an error of the kind Transport. Waits for nobody.
+    // Replaces close() on a rank that leaves because of an exception, when the others may never reach their close().
+    // They get an error of the kind Transport. Waits for nobody.
     void leave()
     {
         if (!object_)
@@ -102,14 +102,14 @@ public:
         struct Left {};
         const py::gil_scoped_release released;
         try {
-            const auto ended = std::move(object_); // whose connection asks whether an exception passes
+            const auto ended = std::move(object_); // its connection checks whether there is an exception
             throw Left();
         } catch (const Left&) {
         }
     }
 
 protected:
-    // A call of the object, which takes one at a time. Throws InvalidArgument if there cannot be one.
+    // A call of the object, which takes one call at a time. Throws InvalidArgument if it cannot take one now.
     class Use {
     public:
         explicit Use(Collective& owner) : owner_(owner)

@@ -60,7 +60,7 @@ public:
         });
     }
 
-    // In place of composite(): throws on all ranks.
+    // Replaces composite() on a rank that cannot take part; throws on all ranks.
     void fail(const std::string& why)
     {
         const Use use(*this);

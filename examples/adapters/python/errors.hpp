@@ -1,4 +1,4 @@
-// Errors of dfb as the exception dfb.Error, and exceptions of Python as text, which other threads and ranks may have.
+// Converts errors of dfb to the exception dfb.Error, and exceptions of Python to text, for other threads and ranks.
 #pragma once
 
 #include <dfb/error.hpp>
@@ -47,7 +47,7 @@ inline void setError(const dfb::Error& error, const py::object& cause = py::none
         type(error.what(), nameOf(info.kind), info.message, number(info.rank), number(info.tile), number(info.frame),
              number(info.from), number(info.generation), number(info.source), number(info.expected), number(info.got));
     if (!cause.is_none())
-        PyException_SetCause(value.ptr(), cause.inc_ref().ptr()); // takes the reference
+        PyException_SetCause(value.ptr(), cause.inc_ref().ptr()); // it takes over the reference
     PyErr_SetObject(type.ptr(), value.ptr());
 }
 
@@ -59,7 +59,7 @@ inline std::string textOf(const py::handle& exception)
         const std::string detail = py::str(exception);
         if (!detail.empty())
             text += ": " + detail;
-    } catch (const py::error_already_set&) { // its __str__ throws: its type says enough
+    } catch (const py::error_already_set&) { // its __str__ has thrown: the type must do
     }
     return text;
 }
@@ -73,7 +73,7 @@ inline py::object valueOf(const py::error_already_set& error)
     return value;
 }
 
-// Makes `exception`, as it is, the exception of this thread's Python.
+// Makes `exception`, unchanged, the exception of this thread's Python.
 inline void setAgain(const py::object& exception)
 {
     PyErr_SetObject(reinterpret_cast<PyObject*>(Py_TYPE(exception.ptr())), exception.ptr());
@@ -101,8 +101,8 @@ private:
     py::object first_ = py::none();
 };
 
-// Calls body(), with the GIL. Returns what it threw, as an exception that needs no GIL: one of Python as its type and
-// text. Null: nothing.
+// Calls body(), with the GIL. Returns its exception in a form that needs no GIL: for one of Python, its type and text.
+// Null if there was none.
 template <class Body>
 std::exception_ptr caught(Cause& cause, const Body& body)
 {
@@ -118,7 +118,8 @@ std::exception_ptr caught(Cause& cause, const Body& body)
     }
 }
 
-// Calls body() with the GIL, on a thread that does not have it. Throws without it, as above.
+// Takes the GIL on a thread that does not have it, and calls body(). Releases the GIL, and throws what caught()
+// returns.
 template <class Body>
 void withPython(Cause& cause, const Body& body)
 {
@@ -131,9 +132,9 @@ void withPython(Cause& cause, const Body& body)
         std::rethrow_exception(thrown);
 }
 
-// Calls body() without the GIL, and returns its result. What it throws of dfb becomes dfb.Error, whose cause is the
-// exception of the callback that threw on this rank. A callback's KeyboardInterrupt or SystemExit is thrown itself: a
-// program that goes on after errors is to end for those.
+// Calls body() without the GIL, and returns its result. An exception of dfb becomes dfb.Error, whose cause is the
+// exception of the callback that threw on this rank. A callback's KeyboardInterrupt or SystemExit is thrown as it is,
+// because these must also end a program that goes on after errors.
 template <class Body>
 auto withoutGil(const Cause& cause, const Body& body)
 {

@@ -22,7 +22,7 @@
 #include <variant>
 #include <vector>
 
-// The operations. Ranks with different ones get an error that shows these names.
+// The operations. If ranks have different ones, the error shows these names.
 namespace blend {
 class alpha : public dfb::AlphaBlend {};
 class nearest : public dfb::DepthComposite {};
@@ -45,17 +45,17 @@ public:
     virtual const dfb::Image& image() const = 0;
     virtual dfb::Image imageOnAllRanks() = 0;
     virtual void resize(int width, int height) = 0;
-    // A whole frame; its operation's data if it is a NumpyOperation.
+    // Renders a whole frame. `data` is for a NumpyOperation.
     virtual dfb::FrameReport render(const dfb::World& world, const AnyCamera& camera, const RenderBrick& draw,
                                     const dfb::FrameConfig& frame, const NumpyOperation::FrameData& data) = 0;
-    // In its place, on a rank that cannot. Throws on all ranks.
+    // Replaces render() on a rank that cannot take part. Throws on all ranks.
     virtual dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame,
                                   const NumpyOperation::FrameData& data) = 0;
 };
 
 template <class TileOp>
 class FrameBufferOf final : public AnyFrameBuffer {
-    // The connection is there already, of whichever transport.
+    // The connection exists already, so the transport here does not matter.
     using Inner = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, dfb::InprocTransport>;
     static_assert(std::is_same_v<typename Inner::Tile, RenderTile>);
 
@@ -82,7 +82,7 @@ public:
     dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame,
                           const NumpyOperation::FrameData& data) override
     {
-        frame.declared = true; // as the loop's
+        frame.declared = true; // as in the loop of the other ranks
         auto open = inner_.begin(frame, own(data));
         open.abort(why);
         return open.end();
@@ -146,8 +146,8 @@ public:
     {
     }
 
-    // Calls draw(brick, tile) for each brick and each tile that it may be seen in, on several threads in turn. What is
-    // wrong on one rank comes out on all.
+    // Calls draw(brick, tile) for each brick and each tile that it may cover, on several threads in turn. An error on
+    // one rank is raised on all.
     dfb::FrameReport render(const py::object& bricks, const py::object& camera, const py::object& draw)
     {
         const Use use(*this);
@@ -183,7 +183,7 @@ public:
         });
     }
 
-    // In place of render(): throws on all ranks.
+    // Replaces render() on a rank that cannot take part; throws on all ranks.
     void fail(const std::string& why)
     {
         const Use use(*this);
@@ -228,7 +228,7 @@ private:
                                    + ": it must be a dfb.PerspectiveCamera or a dfb.MatrixCamera");
     }
 
-    std::shared_ptr<py::object> function_; // the operation, if it is one of Python
+    std::shared_ptr<py::object> function_; // the operation, if it is a function of Python
 };
 
 } // namespace dfb_python

@@ -1,4 +1,4 @@
-// The extension module dfb._dfb: the library for the package dfb, whose __init__.py is what programs use.
+// The extension module dfb._dfb, on which the package dfb is built. Programs use the package's __init__.py.
 #include "compositor.hpp"
 #include "framebuffer.hpp"
 #include "ranks.hpp"
@@ -24,7 +24,7 @@ using Three = std::array<float, 3>;
 
 dfb::Vec3 vecOf(const Three& v) { return {v[0], v[1], v[2]}; }
 
-// Of a matrix in rows, as numpy has it, the columns one after another.
+// Converts a matrix from numpy's row-major order to columns, one after another.
 std::array<float, 16> columnsOf(const py::object& matrix, const char* name)
 {
     const auto rows = pixelsOf<float>(matrix, {0, 0, 4, 4}, 0, name);

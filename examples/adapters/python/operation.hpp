@@ -19,7 +19,7 @@
 
 namespace dfb_python {
 
-// An input of a tile: what one brick has there.
+// An input of a tile: the pixels of one brick.
 struct OperationInput {
     py::object rgba, depth;
     std::uint32_t source;
@@ -30,7 +30,7 @@ public:
     static constexpr dfb::ChannelMask channels = dfb::colorChannel | dfb::depthChannel;
     static constexpr bool emptyIsBackground = true;
 
-    // The function, which is called by any thread, and where its exceptions go.
+    // The function, which any thread calls, and the place for its exceptions.
     struct FrameData {
         std::shared_ptr<py::object> function;
         std::shared_ptr<Cause> cause;
@@ -62,7 +62,7 @@ public:
         }
         inputs_.clear();
         for (std::size_t i = 0; i < colors.size(); i += 4) {
-            const double light = 1 - colors[i + 3]; // of what is behind
+            const double light = 1 - colors[i + 3]; // that comes from behind
             for (std::size_t c = 0; c < 4; ++c)
                 colors[i + c] += light * static_cast<double>(info_.background[c]);
         }

@@ -1,4 +1,4 @@
-// Ranks: what a program gives as `comm` becomes a connection.
+// Ranks: makes a connection from what a program gives as `comm`.
 #pragma once
 
 #include "errors.hpp"
@@ -55,8 +55,8 @@ inline std::string mpiHeaders()
 #endif
 }
 
-// The MPI whose functions this module calls, as it says itself. With another one in the process these need not be those
-// of its own library.
+// The MPI whose functions this module calls, by its own words. If the process has loaded another MPI too, these may not
+// be the functions of the library that this module was linked to.
 inline std::string mpiLibrary()
 {
     std::vector<char> text(MPI_MAX_LIBRARY_VERSION_STRING);
@@ -68,7 +68,7 @@ inline std::string mpiLibrary()
 #endif
 
 // Calls body(communicator) on `count` threads, one for each rank, and returns the results by rank. Throws the first
-// exception of a body, as it was.
+// exception of a body, unchanged.
 inline py::list runRanks(int count, const py::object& body)
 {
     const auto cause = Cause::make();

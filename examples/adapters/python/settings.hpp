@@ -1,4 +1,4 @@
-// Settings: the arguments of a constructor. What is wrong with them on one rank comes out on all.
+// Settings: the arguments of a constructor. If they are wrong on one rank, all ranks throw.
 #pragma once
 
 #include "errors.hpp"
@@ -20,8 +20,8 @@
 
 namespace dfb_python {
 
-// A reason of this rank's own against the next collective construction or resize(), which then throws on all ranks with
-// this text. The owner map, which each of them asks, carries it: all ranks learn of its exceptions.
+// A reason of this rank against the next collective construction or resize(), which then throws on all ranks with this
+// text. Both call the owner map; it throws the reason, and the library tells all ranks.
 class Veto {
 public:
     dfb::OwnerMap ownerMap() const
@@ -41,7 +41,7 @@ private:
     std::shared_ptr<std::string> why_ = std::make_shared<std::string>();
 };
 
-// Returns an argument as the text of an error shows it.
+// Returns an argument as text for an error.
 inline std::string shown(const py::handle& value) { return py::repr(value); }
 
 // The value of an argument. Throws InvalidArgument if it has another type.
@@ -50,7 +50,7 @@ Value argument(const py::dict& from, const char* name, const char* kind)
 {
     const py::object value = from[name];
     py::detail::make_caster<Value> caster;
-    // Anything would convert to a bool.
+    // No conversion to bool, because anything would convert.
     if (!caster.load(value, !std::is_same_v<Value, bool>))
         throw dfb::InvalidArgument(std::string(name) + " is " + shown(value) + ": it must be " + kind);
     return py::detail::cast_op<Value>(std::move(caster));
@@ -72,14 +72,14 @@ struct Settings {
     dfb::FrameConfig frame;
     Veto veto;
 
-    // With the GIL. Throws nothing: a reason that they cannot be is a veto.
+    // With the GIL. Throws nothing: if arguments are wrong, the reason becomes a veto.
     explicit Settings(const py::dict& from)
     {
         config.image.ownerMap = veto.ownerMap();
         attempt([&] { read(from); });
     }
 
-    // Calls body(), with the GIL, and makes a veto of what it throws.
+    // Calls body(), with the GIL, and makes its exception a veto.
     template <class Body>
     void attempt(const Body& body)
     {
@@ -99,7 +99,7 @@ struct Settings {
 private:
     void refuse(const std::string& why)
     {
-        config = dfb::FrameBufferConfig(1, 1); // which can be: the veto is what all ranks are told
+        config = dfb::FrameBufferConfig(1, 1); // this is valid, so all ranks get the veto
         config.image.ownerMap = veto.ownerMap();
         veto.set(why);
     }

@@ -1,4 +1,4 @@
-// PythonTile: a tile as a renderer in Python gets it; and pixels as arrays of numpy.
+// PythonTile: a tile for a renderer in Python; and pixels as numpy arrays.
 #pragma once
 
 #include "arrays.hpp"
@@ -20,7 +20,7 @@ namespace dfb_python {
 
 using RenderTile = dfb::Tile<dfb::colorChannel | dfb::depthChannel, 64>;
 
-// An array with nothing in it: 0, or +infinity for depths.
+// Cleared arrays: colours are 0, depths +infinity.
 inline py::array_t<float> emptyColors(int width, int height)
 {
     py::array_t<float> array({height, width, 4});
@@ -34,8 +34,8 @@ inline py::array_t<float> emptyDepths(int width, int height)
     return array;
 }
 
-// `object` as an array of this type, whose rows lie one after another. Throws InvalidArgument unless it has `channels`
-// numbers for each pixel of a region. 0 channels: one, without an axis of its own.
+// Converts `object` to a contiguous array of this type. Throws InvalidArgument unless it has `channels` numbers for
+// each pixel of a region. 0 channels: one number, without an axis for channels.
 template <class Number>
 using PixelArray = py::array_t<Number, py::array::c_style | py::array::forcecast>;
 template <class Number>
@@ -66,7 +66,7 @@ struct PythonTile {
     {
     }
 
-    // Copies what the renderer has made. Throws InvalidArgument if these are no such pixels any more.
+    // Copies what the renderer has made. Throws InvalidArgument if it has replaced the arrays by wrong ones.
     void copyTo(RenderTile& tile) const
     {
         const auto colors = pixelsOf<float>(rgba, tile.region, 4, "tile.rgba");

@@ -1,9 +1,9 @@
-// ImageViews: an image as arrays of numpy, without a copy.
+// ImageViews: numpy arrays on the memory of an image, without a copy.
 //
-// The library keeps an image in the same blocks of its memory pool from frame to frame. They go back to the pool when
-// the framebuffer ends or gets another size, and the pool gives its memory to the system when the last handle of it has
-// gone. So each array holds the pool, and is never left without its memory. Only resize() uses blocks of the pool anew
-// while it goes on: it is refused while there are arrays.
+// The library keeps an image in the same blocks of its memory pool from frame to frame. They return to the pool when
+// the framebuffer ends or is resized, and the pool frees its memory when its last handle is gone. So each array holds a
+// handle of the pool, and its memory stays valid. Only resize() would reuse these blocks, so it is refused while there
+// are arrays.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -41,7 +41,7 @@ public:
     {
     }
 
-    // Whether there are any. Arrays made of an array, such as slices, count.
+    // Whether there are arrays. Arrays made from an array, such as slices, count.
     bool any() const noexcept { return pool_.use_count() > 1; }
 
     py::object color(const dfb::Image& image) const
@@ -56,7 +56,7 @@ public:
 private:
     using Held = std::shared_ptr<std::shared_ptr<dfb::MemoryPool>>;
 
-    // The library knows which pixels of its image are background, and does not write those again.
+    // Read-only, because the library does not write pixels again that are background already.
     static py::object readOnly(const py::array& array)
     {
         array.attr("setflags")(py::arg("write") = false);
@@ -71,7 +71,7 @@ private:
     Held pool_;
 };
 
-// The colour and the depth of an image that belongs to nobody else; None where it has none.
+// Arrays of the colour and depth of an image, which they own; None for what it does not have.
 inline py::tuple ownArrays(dfb::Image image)
 {
     if (image.empty())

@@ -26,8 +26,8 @@ __version__ = _dfb.version
 has_mpi = _dfb.has_mpi
 """Whether this module can work with communicators of mpi4py."""
 
-# The objects that are not closed yet, with their communicator, in the order in which all ranks make them. They are kept
-# here because their end is collective: it must not depend on when Python collects its garbage.
+# Objects that are not closed yet, with their communicators, in the order in which all ranks make them. They are kept
+# here because their end is collective, so it must not depend on Python's garbage collector.
 _open = {}
 _numbers = itertools.count()
 
@@ -44,7 +44,7 @@ def _end_all(is_its, leaves):
             impl.close()
 
 
-# An exception that has ended the program, on this rank alone perhaps, is in sys.last_type then.
+# If an exception has ended the program, perhaps on this rank only, sys.last_type is set.
 atexit.register(lambda: _end_all(lambda comm: True, hasattr(sys, "last_type")))
 
 
@@ -74,7 +74,8 @@ def run_ranks(count, function):
         if not thrown:
             raise
     try:
-        # The first, but not what a rank has heard of another that leaves, which may have come sooner.
+        # The first exception, but not a Transport error, if there is another: it only says that some other rank has
+        # left.
         raise min(thrown, key=lambda error: isinstance(error, Error) and error.kind == "Transport")
     finally:
         thrown.clear()
@@ -156,7 +157,7 @@ class _Collective:
         """
         if isinstance(why, BaseException):
             why = f"{type(why).__name__}: {why}"
-        # The name of a file may have characters that no encoding has.
+        # The name of a file may have characters that cannot be encoded.
         self._impl.fail(str(why).encode(errors="backslashreplace").decode())
 
     def resize(self, width, height):
