@@ -1,4 +1,4 @@
-// What the benchmarks compare with: MPI called plainly.
+// Plain calls of MPI, with which the benchmarks compare; and what their programs have in common.
 #pragma once
 
 #include "options.hpp"
@@ -40,7 +40,7 @@ inline double sleeps()
     return static_cast<double>(usage.ru_nvcsw);
 }
 
-// Naps of this thread, and of threads that it starts, last what they should and not 50 us more.
+// Lets naps of this thread, and of threads that it starts later, last as long as asked, and not 50 us longer.
 inline void shortenNaps()
 {
 #if defined(__linux__)
@@ -87,7 +87,7 @@ inline const char* nameOf(Waiting waiting)
                                         : "MPI test+nap";
 }
 
-// The CPU time that this thread has spent in sched_yield() while it waited: no work of the system that is measured.
+// The CPU time that this thread has spent in sched_yield() while it waited: that is not work of the measured system.
 inline double& yieldedSeconds()
 {
     static thread_local double seconds = 0;
@@ -150,7 +150,7 @@ inline void plainReceive(std::byte* data, std::size_t byteCount, int from, int t
     complete(request, waiting);
 }
 
-// Indices of some requests that have completed, one at least.
+// Waits; returns the indices of completed requests, at least one.
 inline std::vector<int> someOf(std::vector<MPI_Request>& requests, Waiting waiting)
 {
     std::vector<int> indices(requests.size());
@@ -189,7 +189,7 @@ inline void meet(MPI_Comm comm)
     napThrough(request);
 }
 
-// What rank 0 says.
+// Returns the value of rank 0 on all ranks.
 inline double agree(MPI_Comm comm, double value)
 {
     MPI_Request request = MPI_REQUEST_NULL;
@@ -232,7 +232,7 @@ inline std::vector<double> collect(MPI_Comm comm, const std::vector<double>& sam
 
 // ---- a program
 
-// What all benchmarks are called with. Ends the program after --help, or if it was called wrongly.
+// The arguments that all benchmarks take. Ends the program after --help, or if it was called wrongly.
 struct Arguments {
     bool quick = false;
     std::string only; // digits of the parts to run; empty: all

@@ -1,5 +1,5 @@
-// The partial images that compositing starts from, and what they make together, exactly: Scene, of which BrickScene is
-// one: each rank has one brick of a cube, seen from obliquely above, as a ray marcher would have rendered it.
+// Scene: the partial images that compositing starts from, and the exact image that they make together. BrickScene: each
+// rank has one brick of a cube, seen obliquely from above, as a ray marcher would render it.
 #pragma once
 
 #include <dfb/testing/reference.hpp>
@@ -19,18 +19,18 @@ namespace bench {
 struct PartialImage {
     int width = 0, height = 0;     // of the pixels that are stored
     int left = 0, top = 0;         // where they are in the image
-    std::array<int, 4> viewport{}; // x, y, width, height of what may have pixels
+    std::array<int, 4> viewport{}; // x, y, width, height of the part that may have pixels
     std::vector<float> rgba;       // premultiplied, 4 a pixel
     std::vector<float> depth;      // infinite where there is nothing
 
-    // Of a pixel of the image, which must be stored.
+    // The index of a pixel of the image, which must be stored.
     std::size_t indexOf(int x, int y) const
     {
         return static_cast<std::size_t>(y - top) * static_cast<std::size_t>(width) + static_cast<std::size_t>(x - left);
     }
 };
 
-// What an image should be, in every rowStep-th of its rows from the first on.
+// The exact image, in every rowStep-th row from the first on.
 struct ExactImage {
     int width = 0, rowStep = 1;
     std::vector<dfb::testing::Pixel> pixels{};
@@ -44,7 +44,7 @@ struct ExactImage {
     }
 };
 
-// What each rank has of an image. In each pixel the ranks lie behind each other in the same order.
+// The part of an image that each rank has. The ranks are in the same order of depth in each pixel.
 class Scene {
 public:
     Scene(const Scene&) = delete;
@@ -80,8 +80,8 @@ public:
         return image;
     }
 
-    // The same with only those pixels stored that are in the tiles of this size that the viewport meets; it is that
-    // within which the rank can have any. For many ranks at once, or one after the other in the same memory.
+    // The same, but stores only the pixels in tiles of this size that the viewport meets, outside of which the rank has
+    // no pixels. For many ranks at once, or for one after the other in the same memory.
     void renderPart(int rank, int tileSize, PartialImage& image) const
     {
         image.viewport = viewportOf(boundsOf(rank));
@@ -100,7 +100,8 @@ public:
             }
     }
 
-    // What the images of all ranks make together; slow. It holds none of these images, only the rows it is asked for.
+    // The exact image that the images of all ranks make together; slow. It stores none of these images, only the rows
+    // that are asked for.
     ExactImage exact(int rowStep = 1) const
     {
         ExactImage result{width_, rowStep};
@@ -117,7 +118,7 @@ public:
     }
 
 protected:
-    // In the order of the ranks, until it is set.
+    // The order is that of the ranks, until it is set.
     Scene(int ranks, int width, int height) : width_(width), height_(height)
     {
         std::vector<int> order(static_cast<std::size_t>(ranks));
@@ -131,15 +132,15 @@ protected:
         for (std::size_t i = 0; i < order_.size(); ++i)
             place_[static_cast<std::size_t>(order_[i])] = static_cast<int>(i);
     }
-    // Where a rank is in the order. Depths that grow with it keep the order.
+    // The place of a rank in the order. Depths that grow with it keep the order.
     int placeOf(int rank) const { return place_[static_cast<std::size_t>(rank)]; }
 
-    // Of a pixel's centre; the image is 3.4 high, and 0 is in its middle.
+    // The position of a pixel's centre; the image is 3.4 high, and 0 is in its middle.
     std::array<double, 2> positionOf(int x, int y) const
     {
         return {3.4 * (x + 0.5 - 0.5 * width_) / height_, 3.4 * (0.5 * height_ - y - 0.5) / height_};
     }
-    // The pixel that such a position is in, or is next to if it is outside the image.
+    // The pixel at such a position, or the nearest one if it is outside the image.
     std::array<int, 2> pixelAt(double u, double v) const
     {
         return {std::clamp(static_cast<int>(std::floor(u * height_ / 3.4 + 0.5 * width_)), 0, width_ - 1),
@@ -155,15 +156,16 @@ protected:
     }
 
 private:
-    // What a rank has in a pixel: premultiplied, and its depth; false, and nothing written, if it has nothing.
+    // Stores a rank's premultiplied colour and depth in a pixel. Returns false, and stores nothing, if it has nothing
+    // there.
     virtual bool shade(int rank, int x, int y, float* rgba, float& depth) const = 0;
-    // Outside of this rectangle (x, y, width, height) it has nothing.
+    // The rectangle (x, y, width, height) outside of which a rank has nothing.
     virtual std::array<int, 4> boundsOf(int) const { return {0, 0, width_, height_}; }
-    // The part of the image in which a renderer would look for pixels, given that in which there are any.
+    // The part of the image in which a renderer would look for pixels, given the part that has any.
     virtual std::array<int, 4> viewportOf(const std::array<int, 4>& used) const { return used; }
 
     int width_, height_;
-    std::vector<int> order_, place_; // front to back; and where each rank is in that
+    std::vector<int> order_, place_; // the ranks front to back; the place of each rank in that
 };
 
 class BrickScene : public Scene {

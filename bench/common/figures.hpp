@@ -1,4 +1,4 @@
-// What the benchmarks measure and report with; nothing of MPI.
+// Times, figures and tables of the benchmarks, without MPI.
 #pragma once
 
 #include <algorithm>
@@ -33,7 +33,7 @@ inline double threadCpuSeconds() { return cpuSeconds(CLOCK_THREAD_CPUTIME_ID); }
 
 // ---- figures and tables
 
-// The median absolute deviation says how far from the median half of the samples are at most. A quarter of the samples
+// The median absolute deviation: half of the samples are no farther than that from the median. A quarter of the samples
 // is below `low`, a quarter above `high`.
 struct Figure {
     double median = 0, deviation = 0;
@@ -68,7 +68,7 @@ inline Figure figureOf(std::vector<double> samples)
     return figure;
 }
 
-// Three digits of it.
+// The value with three digits.
 inline std::string text(double value)
 {
     char out[32];
@@ -120,7 +120,7 @@ public:
         return out;
     }
 
-    // Behind what the file has.
+    // Appends the table to a file.
     void appendTo(const std::string& path, const std::string& title) const
     {
         std::ofstream file(path, std::ios::app);
@@ -130,7 +130,7 @@ public:
     }
 
 private:
-    // Of UTF-8.
+    // The number of letters of a text in UTF-8.
     static std::size_t lettersOf(const std::string& s)
     {
         return static_cast<std::size_t>(

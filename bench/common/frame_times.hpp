@@ -1,4 +1,4 @@
-// FrameTimer: the time of a frame over all ranks, also where these have clocks of their own.
+// FrameTimer: the time of a frame over all ranks, also if these have different clocks.
 #pragma once
 
 #include "baselines.hpp"
@@ -14,8 +14,8 @@ namespace bench {
 
 // In ms, from when the first rank began.
 struct Times {
-    double image = 0;    // rank 0 has it; without compositing: all ranks have rendered
-    double rendered = 0; // the slowest rank has rendered
+    double image = 0;    // until rank 0 has it; without compositing, until all ranks have rendered
+    double rendered = 0; // until the slowest rank has rendered
     double cpu = 0;      // of all ranks
     double busiest = 0;  // CPU time of the rank with the most: near the frame's time where each has a core
 
@@ -23,8 +23,8 @@ struct Times {
     double overhead() const { return image - rendered; }
 };
 
-// Ranks on other nodes than rank 0's ask for its time, before each frame, as clocks drift; what came back soonest is
-// off by half of the time that took, at most.
+// Ranks on other nodes ask rank 0 for its time before each frame, because clocks drift. They use the answer that came
+// back soonest, whose error is at most half of the time that it took.
 class FrameTimer {
 public:
     // Collective, as is all that it does. The communicator remains the caller's.
@@ -67,7 +67,7 @@ public:
     }
 
 private:
-    // Rank 0's.
+    // The time of rank 0's clock.
     double clock() const { return now() + offset_; }
 
     void synchronize()
@@ -101,7 +101,7 @@ private:
     MPI_Comm comm_;
     int rank_ = 0;
     bool isElsewhere_ = false;
-    std::vector<int> elsewhere_; // on rank 0: who asks
+    std::vector<int> elsewhere_; // on rank 0: the ranks that ask
     double offset_ = 0;          // to rank 0's clock
 };
 

@@ -1,4 +1,4 @@
-// Options: what the benchmarks are called with; nothing of MPI.
+// Options: the command lines of the benchmarks, without MPI.
 #pragma once
 
 #include "figures.hpp"
@@ -23,7 +23,7 @@ inline std::vector<std::string> partsOf(const std::string& text, char separator)
     return parts;
 }
 
-// "1024x768"; false if it is none, or smaller than 16.
+// Reads "1024x768". Returns false if it is no size, or a side is smaller than 16.
 inline bool readSize(const std::string& text, int& width, int& height)
 {
     return std::sscanf(text.c_str(), "%dx%d", &width, &height) == 2 && width >= 16 && height >= 16;

@@ -14,7 +14,7 @@
 namespace bench {
 
 // Each rank has discs all over the image, together between a fifth and a quarter of its pixels. A renderer knows no
-// bounds but those of the whole image.
+// bounds except the whole image.
 class OverlapScene : public Scene {
 public:
     // `turn`: moves the discs.
@@ -41,7 +41,7 @@ private:
         return numbers;
     }
 
-    // There is a disc in most cells of a grid, which is another one for each rank.
+    // There is a disc in most cells of a grid. Each rank has a different grid.
     bool shade(int rank, int x, int y, float* rgba, float& depth) const override
     {
         const std::array<double, 4> shift = numbersOf(rank, -1, -1);

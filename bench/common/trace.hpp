@@ -1,4 +1,4 @@
-// Trace: what --trace FILE asks of a benchmark.
+// Trace: the option --trace FILE of a benchmark.
 #pragma once
 
 #include <dfb/trace_file.hpp>
@@ -9,7 +9,8 @@
 
 namespace bench {
 
-// Of the framebuffers of one connection on this rank, whose configuration gets `sink`. An empty path: there is none.
+// A trace of the framebuffers of one connection on this rank, whose configuration gets `sink`. With an empty path there
+// is no trace.
 struct Trace {
     explicit Trace(std::string file)
         : sink(file.empty() ? nullptr : std::make_shared<dfb::TraceFile>()), path(std::move(file))

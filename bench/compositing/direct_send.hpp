@@ -30,7 +30,7 @@ private:
         return all;
     }
 
-    // What `from` has in the slice of `owner`.
+    // The part of the slice of `owner` in which `from` may have pixels.
     Part partOf(int from, int owner) const { return overlap(viewports_[static_cast<std::size_t>(from)], slice(owner)); }
 
     void blendSlice(const std::vector<float>& rgba) override

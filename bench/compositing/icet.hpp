@@ -11,14 +11,15 @@
 
 namespace bench {
 
-// A way to composite, and its name for a table. `singleImage` is of no account for ICET_STRATEGY_DIRECT.
+// A way to composite, and its name for a table. ICET_STRATEGY_DIRECT ignores `singleImage`.
 struct IceTStrategy {
     const char* name;
     IceTEnum strategy, singleImage;
 };
 
-// All that keep an order; ICET_STRATEGY_SPLIT and ICET_STRATEGY_VTREE do not. Sequential is what IceT's manual advises
-// for one tile. Reduce leaves ranks out that have nothing in the image, for which it asks all of them first.
+// All strategies that keep an order; ICET_STRATEGY_SPLIT and ICET_STRATEGY_VTREE do not. Sequential is what IceT's
+// manual advises for one tile. Reduce leaves ranks out that have nothing in the image, for which it asks all of them
+// first.
 inline std::vector<IceTStrategy> icetStrategies()
 {
     return {
@@ -48,15 +49,16 @@ struct IceTSettings {
 
 // ---- MPI for IceT
 
-// What a rank has sent to others. Of a collective: what it has to send if nobody passes on anything for others.
+// What a rank has sent to others. A collective call counts as what the rank must send if no rank forwards data of
+// others.
 struct IceTTraffic {
     std::int64_t bytes = 0, messages = 0;
 };
 
-// A communicator as IceT wants it, whose waits are as in `waiting`.
+// A communicator for IceT, which waits as `waiting` says.
 class IceTMpi : public IceTCommunicatorStruct {
 public:
-    // Of a communicator that remains the caller's, as does `traffic`; to be duplicated by IceT.
+    // The communicator and `traffic` remain the caller's. IceT duplicates this object.
     IceTMpi(MPI_Comm comm, Waiting waiting, IceTTraffic& traffic)
         : IceTCommunicatorStruct{}, comm_(comm), waiting_(waiting), traffic_(&traffic)
     {
@@ -279,7 +281,7 @@ public:
         MPI_Comm_rank(comm, &rank_);
         MPI_Comm_size(comm, &size_);
         IceTMpi mpi(comm, settings.waiting, traffic_);
-        context_.reset(icetCreateContext(&mpi)); // of a duplicate
+        context_.reset(icetCreateContext(&mpi)); // makes a duplicate of `mpi`
         icetSetContext(context_.get());
         icetDiagnostics(ICET_DIAG_WARNINGS | ICET_DIAG_ALL_NODES);
         icetSetColorFormat(ubyte_ ? ICET_IMAGE_COLOR_RGBA_UBYTE : ICET_IMAGE_COLOR_RGBA_FLOAT);
@@ -297,11 +299,11 @@ public:
     IceT(const IceT&) = delete;
     IceT& operator=(const IceT&) = delete;
 
-    // Collective: "over" of the images of all ranks, which `order` has from front to back, the same on all. `colour` is
-    // this rank's whole image, premultiplied RGBA in rows without gaps, floats or bytes (at an address divisible by 4)
-    // as the settings say; `viewport` (x, y, width, height) the part outside of which it is ignored, which may be
-    // empty. Where alpha is 0 IceT takes a pixel for empty, whatever its colour. On rank 0 returns the image, likewise,
-    // which is IceT's until the next call; elsewhere null. Throws std::runtime_error.
+    // Collective: blends the images of all ranks with "over". `order` has the ranks from front to back, the same on
+    // all. `colour` is this rank's whole image, premultiplied RGBA in rows without gaps, floats or bytes (at an address
+    // divisible by 4) as the settings say; `viewport` (x, y, width, height) the part outside of which it is ignored,
+    // which may be empty. Where alpha is 0 IceT takes a pixel for empty, whatever its colour. On rank 0 returns the
+    // image, likewise, which is IceT's until the next call; elsewhere null. Throws std::runtime_error.
     const void* composite(const void* colour, const int viewport[4], const std::vector<int>& order)
     {
         constexpr IceTDouble identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
@@ -317,13 +319,13 @@ public:
         return ubyte_ ? static_cast<const void*>(icetImageGetColorcub(image)) : icetImageGetColorcf(image);
     }
 
-    // By this rank to others, since it was reset.
+    // Sent by this rank to others since the last reset.
     std::int64_t bytesSent() const { return traffic_.bytes; }
     std::int64_t messagesSent() const { return traffic_.messages; }
     void resetTraffic() { traffic_ = {}; }
 
 private:
-    // IceT has printed what it was.
+    // IceT has printed the error already.
     static void check()
     {
         if (icetGetError() != ICET_NO_ERROR)

@@ -1,6 +1,6 @@
-// MemoryLimit: what no way to make one image of what all ranks have can do without, on one node: each rank reads its
-// part of the image once, and the part of the final image in which there is anything is written once, shared out over
-// the ranks. Nothing is blended, nor handed on.
+// MemoryLimit: the least memory traffic with which one image can be made of those of all ranks on one node. Each rank
+// reads its part of the image once, and the part of the final image that has anything is written once, shared out over
+// the ranks. Nothing is blended or sent.
 #pragma once
 
 #include "baselines.hpp"

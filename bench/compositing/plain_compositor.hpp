@@ -1,6 +1,6 @@
-// PlainCompositor: what the compositors have in common that one would write without a library: each rank ends up with
-// some rows of the image, blended in order in plain float (A += (1 - A) a), which rank 0 gathers. Nothing overlaps with
-// anything, no empty pixel is left out but those outside the ranks' viewports.
+// PlainCompositor: the common part of compositors as one would write them without a library. Each rank ends up with
+// some rows of the image, blended in order in plain float (A += (1 - A) a), which rank 0 gathers. No two steps run at
+// the same time, and no empty pixels are left out except those outside the ranks' viewports.
 #pragma once
 
 #include "baselines.hpp"
@@ -21,7 +21,7 @@ public:
     PlainCompositor& operator=(const PlainCompositor&) = delete;
     virtual ~PlainCompositor() = default;
 
-    // Collective. `rgba`: what this rank has, of the whole image. On rank 0 the image: floats, or bytes.
+    // Collective. `rgba`: this rank's image, of the full size. On rank 0 returns the image, as floats or bytes.
     const std::byte* composite(const std::vector<float>& rgba)
     {
         sent_ = messages_ = 0;
@@ -77,19 +77,19 @@ protected:
         return static_cast<std::size_t>(rows[1] - rows[0]) * static_cast<std::size_t>(width_);
     }
     std::vector<float>& sum() { return sum_; } // of this rank's slice
-    // Parts that go to other ranks, and that come from them: by who that is, and kept from frame to frame, as touching
-    // new memory takes as long as all the rest.
+    // Parts that go to other ranks, and that come from them, by rank. They are kept from frame to frame, because
+    // touching new memory takes as long as all the rest.
     std::vector<float>& out(int i) { return out_[static_cast<std::size_t>(i)]; }
     std::vector<float>& in(int i) { return in_[static_cast<std::size_t>(i)]; }
 
-    // What of a viewport is in these rows.
+    // The part of a viewport that is in these rows.
     static Part overlap(const Part& viewport, const Rows& rows)
     {
         const int y0 = std::max(viewport[1], rows[0]), y1 = std::min(viewport[1] + viewport[3], rows[1]);
         return {viewport[0], y0, viewport[2], viewport[2] > 0 ? y1 - y0 : 0};
     }
 
-    // A part of rows that begin with `firstRow`.
+    // Copies a part out of rows that begin with `firstRow`.
     void pack(const std::vector<float>& rows, int firstRow, const Part& part, std::vector<float>& to) const
     {
         const std::size_t row = 4 * static_cast<std::size_t>(part[2]);
@@ -129,7 +129,7 @@ private:
     // Collective: makes the sum of this rank's slice.
     virtual void blendSlice(const std::vector<float>& rgba) = 0;
 
-    // In floats, of a part's row.
+    // The index of a part's row, in floats.
     std::size_t placeOf(const Part& part, int row) const
     {
         return 4

@@ -22,7 +22,7 @@ public:
     {
     }
 
-    // Factors up to `most`, the greatest first; a prime number above it is one by itself.
+    // Factors up to `most`, the greatest first; a prime factor above `most` is kept as it is.
     static std::vector<int> factorsOf(int ranks, int most)
     {
         std::vector<int> factors;
@@ -61,7 +61,7 @@ private:
         return all;
     }
 
-    // What the ranks at `count` places from `first` on may have together.
+    // The part of the image in which the ranks at `count` places from `first` on may have pixels.
     Part viewportOf(int first, int count) const
     {
         Part all{};
@@ -84,7 +84,7 @@ private:
     {
         const auto own = static_cast<int>(std::find(order_.begin(), order_.end(), rank()) - order_.begin());
         Rows rows{0, height_};
-        int stride = 1; // what the ranks at so many places next to each other have is blended
+        int stride = 1; // the images of so many adjacent ranks are blended already
         for (std::size_t round = 0; round < factors_.size(); ++round) {
             const auto tag = static_cast<int>(round) + 1;
             const int k = factors_[round], me = own / stride % k, first = own - me * stride;

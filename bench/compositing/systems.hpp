@@ -31,7 +31,7 @@ namespace bench {
 
 using dfb::Connection;
 
-// Of all ranks, of what this one has. Collective.
+// The viewports of all ranks. Collective.
 inline std::vector<std::array<int, 4>> viewportsOf(MPI_Comm comm, const PartialImage& image)
 {
     int size = 1;
@@ -43,7 +43,7 @@ inline std::vector<std::array<int, 4>> viewportsOf(MPI_Comm comm, const PartialI
     return all;
 }
 
-// What an image is made of: what one camera sees.
+// The partial images of one camera.
 struct View {
     View(MPI_Comm comm, const Scene& scene, int rank)
         : image(scene.render(rank)), viewports(viewportsOf(comm, image)), order(scene.order())
@@ -55,7 +55,7 @@ struct View {
     std::vector<int> order;                    // the ranks, front to back
 };
 
-// What the frames of a run are made of: a view each, in turn. A camera that stands still has one.
+// The views of a run; frames take them in turn. A camera that does not move has one.
 struct Inputs {
     Inputs(MPI_Comm communicator, const Scene& scene, int rank) : comm(communicator), views{View(comm, scene, rank)} {}
 
@@ -72,7 +72,7 @@ struct Inputs {
     const std::vector<int>& order() const { return view().order; }
 };
 
-// What makes the image, and what is known of it.
+// Makes the image, and knows what it has cost.
 struct Compositor {
     std::function<void()> frame; // collective
     // Of the last frame on rank 0: 4 a pixel, one of the two; none, if it makes no image.
@@ -95,7 +95,7 @@ struct System {
     std::string title() const { return name + ": " + config + ", to " + output; }
 };
 
-// Keeps those of which the title has one of the texts in `only`, with | between; all if it is empty.
+// Keeps the systems whose title has one of the texts in `only`, which are separated by |; all if it is empty.
 inline void keepWanted(std::vector<System>& systems, const std::string& only)
 {
     const std::vector<std::string> parts = partsOf(only, '|');
@@ -109,7 +109,7 @@ inline void keepWanted(std::vector<System>& systems, const std::string& only)
 
 // ---- dfb: an ImageCompositor, or a framebuffer whose renderer shows it images that are ready, tile by tile
 
-// Each rank has one brick, whose box says no more than which rank that is.
+// Each rank has one brick, whose box only says which rank that is.
 inline dfb::World worldOf(int rank)
 {
     dfb::World world;
@@ -132,7 +132,7 @@ struct ViewportCamera {
 template <class TileOp>
 inline constexpr bool isOrdered = TileOp::rule == dfb::BlendRule::InOrder;
 
-// The row of what a program gets that sets nothing.
+// The row of a program that sets nothing.
 inline const char* const defaultConfig = "float32, defaults";
 
 struct DfbSettings {
@@ -141,7 +141,7 @@ struct DfbSettings {
     float minTransmittance = 0;
     bool isDefault = false;
     dfb::CompressionMode compression = dfb::CompressionMode::Always;
-    bool hasThreads = false;        // a worker; else the executor has none
+    bool hasThreads = false;        // a worker; otherwise the executor has none
     bool hasDefaultThreads = false; // those that a framebuffer makes by itself
     bool isShared = false;          // the images lie in memory that the node shares, and are read there
     bool hasBytes = false;          // images of 8 bits a channel, which are ready
@@ -184,7 +184,7 @@ struct DfbImage {
     const std::uint8_t* color8 = nullptr;
 };
 
-// Without `hasThreads` what each rank does is done by one thread, as with the other systems.
+// Without `hasThreads` each rank works with one thread, as in the other systems.
 inline std::shared_ptr<Connection> makeConnection(MPI_Comm comm, bool hasThreads)
 {
     dfb::NetworkConfig options;
@@ -207,7 +207,7 @@ inline dfb::FrameBufferConfig configOf(const Inputs& inputs, const DfbSettings& 
     return c;
 }
 
-// Adds a system to floats and one to bytes. `start(toBytes)` makes its Compositor.
+// Adds a system with float output and one with 8-bit output. `start(toBytes)` makes its Compositor.
 template <class Start>
 void addToBoth(std::vector<System>& systems, const std::string& config, const DfbSettings& settings, const Start& start)
 {
@@ -341,7 +341,7 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
 
 // ---- the peers
 
-// `make(toBytes)` makes a PlainCompositor, in a shared pointer. They know one view only.
+// `make(toBytes)` makes a PlainCompositor, in a shared pointer. These compositors know one view only.
 template <class Make>
 void addPlain(std::vector<System>& systems, const Inputs& inputs, const std::string& config, const Make& make)
 {
@@ -477,7 +477,7 @@ inline void addIceT(std::vector<System>& systems, const Inputs& inputs)
 
 // ---- measuring
 
-// As testing::toUnorm8(), and as exact, but fast: 255 times a float is a double, and rounds to even.
+// Like testing::toUnorm8() and as exact, but fast: 255 times a float fits in a double, which is rounded to even.
 inline std::uint8_t levelOf(float value)
 {
     return static_cast<std::uint8_t>(std::nearbyint(255 * std::min(std::max(0.0, static_cast<double>(value)), 1.0)));
@@ -496,7 +496,7 @@ inline dfb::testing::ErrorReport errorOf(const float* floats, const std::uint8_t
     return report;
 }
 
-// Reads all of an image, as whoever shows or stores it does; returns something that depends on each byte.
+// Reads all of an image, as a program that shows or stores it does; returns something that depends on each byte.
 inline std::uint64_t readAll(const void* image, std::size_t byteCount)
 {
     const auto* bytes = static_cast<const std::byte*>(image);

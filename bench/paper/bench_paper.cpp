@@ -1,10 +1,10 @@
-// The figures of the paper (section 6), with data that is generated from a seed in place of its own, of which no rank
-// holds more than its part (in figure 6 each has all of it, as is the nature of image-parallel rendering).
+// The figures of the paper (section 6), with data generated from a seed instead of the paper's own. Each rank holds
+// only its part of the data (in figure 6 all of it, because rendering is image-parallel).
 //   mpirun -n 8 bench_paper --figure 6|7|8|9|10 [--ranks 1,2,4,8] [--size 512x512,...] [--views 12] [--repeats 1]
 //     [--scale 1] [--seed 1] [--threads 1] [--compress never|always|auto] [--check VIEWS] [--json FILE] [--svg FILE]
 //     [--table FILE] [--ppm FILE] [--trace FILE] [--commit ID]
-// Each number of ranks is measured on the first so many of those that there are; the others sleep meanwhile. --check
-// compares the images from so many views with those of another distribution of the same scene. --scale: of the data's
+// Each number of ranks is measured with that many of the job's ranks, while the others sleep. --check compares the
+// images from so many views with those of another distribution of the same scene. --scale: factor for the data's
 // resolution along each side. --trace: of dfb, with the last number of ranks and size.
 #include "marched_bricks.hpp"
 #include "paper_figures.hpp"
@@ -54,13 +54,13 @@ struct Options {
     }
 };
 
-// Distance of two images.
+// The largest difference of two images.
 double differenceOf(const std::vector<float>& a, const std::vector<float>& b)
 {
     double largest = a.size() == b.size() ? 0 : 1e30;
     for (std::size_t i = 0; i < std::min(a.size(), b.size()); ++i) {
         const double d = std::abs(static_cast<double>(a[i]) - static_cast<double>(b[i]));
-        largest = d <= largest ? largest : d; // also one that is not a number
+        largest = d <= largest ? largest : d; // also if d is NaN
     }
     return largest;
 }

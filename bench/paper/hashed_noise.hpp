@@ -1,5 +1,5 @@
-// HashedNoise: gradient noise (Perlin 2002) whose gradients come from a hash, so that any rank can evaluate any place
-// of a field of any size, and all agree.
+// HashedNoise: gradient noise (Perlin 2002) whose gradients come from a hash, so that any rank can evaluate any point
+// of a field of any size, and all get the same value.
 #pragma once
 
 #include <dfb/render/world.hpp>
@@ -11,7 +11,7 @@
 
 namespace bench {
 
-// Of a lattice point; well mixed (the end is that of MurmurHash3).
+// The hash of a lattice point; well mixed (the end is that of MurmurHash3).
 inline std::uint32_t hashOf(std::uint32_t seed, int x, int y, int z)
 {
     std::uint32_t h = seed * 0x9e3779b9u;

@@ -31,7 +31,7 @@ struct Traced {
     float depth = std::numeric_limits<float>::infinity();
     float through = 1; // of the light from behind
 
-    // Over what comes behind; the colour is not premultiplied.
+    // Adds a sample behind the earlier ones; the colour is not premultiplied.
     void add(float t, const dfb::Vec3& color, float alpha)
     {
         if (!(alpha > 0))
@@ -47,7 +47,7 @@ struct Traced {
     }
 };
 
-// Half-open: what belongs to a brick is up to where a point is, and no rank needs to ask another.
+// Half-open: the point alone decides which brick has it, so ranks need not ask each other.
 inline bool contains(const dfb::Box3& box, const dfb::Vec3& p)
 {
     return p.x >= box.lower.x && p.y >= box.lower.y && p.z >= box.lower.z && p.x < box.upper.x && p.y < box.upper.y
@@ -62,7 +62,7 @@ inline bool clip(const dfb::Box3& box, float slack, const dfb::Vec3& origin, con
     leave = std::numeric_limits<float>::max();
     const auto along = [&](float lower, float upper, float from, float to) {
         const float a = (lower - slack - from) / to, b = (upper + slack - from) / to;
-        if (std::isnan(a) || std::isnan(b)) // 0 / 0, of a ray within a face, limits nothing
+        if (std::isnan(a) || std::isnan(b)) // 0 / 0: a ray within a face has no limit here
             return;
         enter = std::max(enter, std::min(a, b));
         leave = std::min(leave, std::max(a, b));
@@ -73,7 +73,8 @@ inline bool clip(const dfb::Box3& box, float slack, const dfb::Vec3& origin, con
     return enter <= leave;
 }
 
-// Of a surface: half of it ambient, which `openness` (0 to 1) dims, the rest from a lamp above the viewer's shoulder.
+// The lit colour of a surface: half of the light is ambient, which `openness` (0 to 1) dims; the rest comes from a lamp
+// above the viewer's shoulder.
 inline dfb::Vec3 lit(const dfb::Vec3& color, dfb::Vec3 normal, const dfb::Vec3& direction, float openness)
 {
     if (dot(normal, direction) > 0)
@@ -86,7 +87,7 @@ inline dfb::Vec3 lit(const dfb::Vec3& color, dfb::Vec3 normal, const dfb::Vec3& 
     return (0.45f * openness + 0.6f * diffuse) * color + 0.25f * gloss * dfb::Vec3{1, 1, 1};
 }
 
-// The rank's part of a scene, between bounds; with as much of what surrounds it as rays need that stay within.
+// A rank's part of a scene, within bounds, with as much of its surroundings as rays within the bounds need.
 class PaperBrick {
 public:
     PaperBrick() = default;
@@ -98,7 +99,7 @@ public:
     virtual void render(const dfb::PerspectiveCamera& camera, const Pixels& to) const = 0;
 };
 
-// Fills a unit cube. Whatever the bounds of its bricks, together they show the same.
+// A scene in a unit cube. However it is cut into bricks, together they show the same.
 struct PaperScene {
     std::string name;
     std::function<std::unique_ptr<PaperBrick>(const dfb::Box3&, dfb::Executor&)> make;

@@ -30,7 +30,7 @@ std::vector<std::string> distinct(const std::vector<Measurement>& of, const Key&
     return names;
 }
 
-// Frames a second of each group of `of` over the ranks; and what they would be if each rank helped as much as the
+// Frames a second over the number of ranks, for each group of `of`; and the ideal, if each rank helped as much as the
 // first.
 template <class Key>
 std::vector<PlotLine> scalingOf(const std::vector<Measurement>& of, const Key& key, bool hasIdeal)
@@ -60,7 +60,7 @@ inline PlotBar barOf(const Measurement& m, const std::string& name, int colour)
     return {name, m.render.median, m.overhead.median, m.result.ms.deviation, colour};
 }
 
-// Nothing is drawn of nothing. Throws std::runtime_error.
+// Draws nothing if there are no measurements. Throws std::runtime_error.
 inline void drawFigure(int figure, const std::string& caption, const std::vector<Measurement>& found,
                        const std::string& path)
 {

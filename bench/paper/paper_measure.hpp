@@ -1,5 +1,5 @@
-// What is measured for the paper's figures: ways to make an image, each of which has its turn from every view; and what
-// has been found, as JSON lines and as a table.
+// Measurements for the paper's figures: ways to make an image, each of which has its turn from every view; and their
+// results, as JSON lines and as a table.
 #pragma once
 
 #include "frame_times.hpp"
@@ -127,8 +127,8 @@ inline std::string sizeText(const Measurement& m)
 inline void writeMeasurements(const std::vector<Measurement>& all, const std::string& caption,
                               const std::string& jsonPath, const std::string& tablePath)
 {
-    // What a speed is compared with: the same on the fewest ranks; in figures 9 and 10, which compare ways, the first
-    // way on as many ranks.
+    // A speed is compared with that of the same way on the fewest ranks; in figures 9 and 10, which compare ways, with
+    // that of the first way on as many ranks.
     const bool comparesWays = !all.empty() && all.front().figure >= 9;
     const auto isReference = [&](const Measurement& m, const Measurement& other) {
         return sizeText(other) == sizeText(m)

@@ -1,6 +1,6 @@
-// Clustered particles as transparent spheres: a stand-in for the Cosmic Web of the paper, of any size. Which particles
-// there are follows from a hash of the cell that they are in, so that a rank makes its own and its neighbours' that
-// reach into its brick.
+// Clustered particles as transparent spheres: a stand-in for the Cosmic Web of the paper, of any size. The particles of
+// a cell follow from a hash of the cell, so a rank makes its own particles, and those of neighbours that reach into its
+// brick.
 #pragma once
 
 #include "hashed_noise.hpp"
@@ -20,11 +20,11 @@ namespace bench {
 
 struct Particle {
     dfb::Vec3 center;
-    float radius = 0, density = 0; // density: 0 to 1, of the web where it is
+    float radius = 0, density = 0; // density: 0 to 1, of the web at its place
     std::uint64_t id = 0;
 };
 
-// Dense where two fields of noise are both near 0: along filaments, with knots where they are so for longer.
+// Dense where two fields of noise are both near 0: along filaments, with knots where they stay near 0.
 class ParticleWeb {
 public:
     ParticleWeb(int cells, std::uint32_t seed) : cells_(cells), seed_(seed), first_(seed), second_(seed + 7919u) {}
@@ -118,7 +118,7 @@ private:
         std::uint32_t particle = 0;
     };
 
-    // A ray that is off by rounding still finds what it touches.
+    // So that a ray with rounding errors still finds what it touches.
     float slack() const { return 1e-3f * cellSize_; }
 
     // Calls visit(cell) for the cells of the grid that a particle may reach into.
@@ -159,7 +159,7 @@ private:
                         [&](std::size_t cell) { content_[next[cell]++] = static_cast<std::uint32_t>(i); });
     }
 
-    // Not inlined: one machine code for all.
+    // Not inlined, so that all bricks run the same machine code.
 #if defined(__GNUC__)
     __attribute__((noinline))
 #endif
@@ -172,7 +172,7 @@ private:
             return sum;
         hits.clear();
         walk(origin, direction, enter, leave, hits);
-        // By id where they are equally far, as another brick would have them. A sphere comes up in several cells.
+        // Equal distances are sorted by id, as in any other brick. A sphere is found in several cells.
         std::sort(hits.begin(), hits.end(), [this](const Hit& a, const Hit& b) {
             return a.t != b.t ? a.t < b.t : particles_[a.particle].id < particles_[b.particle].id;
         });
@@ -233,7 +233,7 @@ private:
             hits.push_back({t, index});
     }
 
-    // Blue by itself, over red to yellow in knots.
+    // From blue for single particles, over red, to yellow in knots.
     static dfb::Vec3 colorOf(const Particle& p)
     {
         const float s = p.density;

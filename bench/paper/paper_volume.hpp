@@ -1,5 +1,5 @@
 // Volumes with two transparent isosurfaces: stand-ins for the Richtmyer-Meshkov and the DNS data of the paper, of any
-// size, each brick of which a rank makes by itself.
+// size, of which each rank makes its brick by itself.
 #pragma once
 
 #include "hashed_noise.hpp"
@@ -25,12 +25,12 @@ struct VolumeLook {
     std::array<Isosurface, 2> surfaces;
     // Extinction of the volume itself, per value above `threshold` and length; 0: only the surfaces are seen.
     float extinction = 0, threshold = 0;
-    int occlusionRays = 0; // for ambient occlusion; see what the brick has
+    int occlusionRays = 0; // for ambient occlusion; they see only what the brick has
     float occlusionReach = 0;
 };
 
-// Samples are at multiples of a step along each ray, whatever the bounds; what is between two samples, as where a
-// surface is crossed, belongs to who has the first of them.
+// Samples are at multiples of a step along each ray, whatever the bounds. What lies between two samples, such as the
+// crossing of a surface, belongs to the brick that has the first of them.
 class VolumeBrick : public PaperBrick {
 public:
     using Field = std::function<float(const dfb::Vec3&)>;
@@ -163,7 +163,7 @@ private:
         return static_cast<int>(std::max(0.0f, steps - 0.02f)) + 1; // 0.02 for rounding
     }
 
-    // Not inlined: one machine code for all.
+    // Not inlined, so that all bricks run the same machine code.
 #if defined(__GNUC__)
     __attribute__((noinline))
 #endif

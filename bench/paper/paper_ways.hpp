@@ -23,7 +23,7 @@
 
 namespace bench {
 
-// A scene, seen by the ranks of a communicator. Must outlive the ways it makes; what it does is collective.
+// A scene, seen by the ranks of a communicator. It must outlive the ways that it makes. Its members are collective.
 class PaperStage {
 public:
     // The communicator remains the caller's; `config` has all but the format.

@@ -1,5 +1,5 @@
-// The way of finished tiles to the display rank: in batches while others still render, or with one MPI_Gatherv.
-// Each rank renders the tiles that it owns, with renderers that cost nothing, time or only patience.
+// The way of finished tiles to the display rank: in batches while others still render, or with one MPI_Gatherv. Each
+// rank renders the tiles that it owns, with renderers that cost nothing, CPU time, or only waiting time.
 //   mpirun -n 2 bench_gather        or -n 4, -n 8; --quick; a list of parts such as 12 takes only those image sizes
 // --trace FILE: of dfb, with the last renderer and size.
 #include "baselines.hpp"
@@ -37,8 +37,8 @@ const char* nameOf(Cost cost)
     }
 }
 
-// Colours a tile, after work that differs between tiles by up to 7 times: none, so much time on this core, or so much
-// time in which something else computes, as a renderer on an accelerator. Notes when it was last done.
+// Colours a tile, after work that differs between tiles by a factor of up to 7: none, time on this core, or time in
+// which something else computes, as with a renderer on an accelerator. Records when it last finished.
 class Renderer {
 public:
     Renderer(Cost cost, double meanSeconds, double stepsPerSecond)
@@ -183,7 +183,7 @@ private:
 
 constexpr std::array<const char*, 3> variants{"dfb", "MPI_Gatherv", "MPI_Igatherv, test+nap"};
 
-// How much of Renderer::compute() a core does when nobody disturbs it.
+// How many steps of Renderer::compute() an undisturbed core does in a second.
 double stepsPerSecond(MPI_Comm comm)
 {
     constexpr std::int64_t steps = 500000;

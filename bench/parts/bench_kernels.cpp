@@ -1,6 +1,6 @@
-// What the loops over pixels cost beside memcpy: blending in a known order and sorted by depth, conversion to the
-// output formats, encoding and decoding of inputs. Each is called as the pipeline of a tile calls it, on one thread,
-// and counted in bytes of its input against memcpy of as many bytes in the same run. No MPI; half a minute.
+// What the loops over pixels cost, compared with memcpy: blending in a known order and sorted by depth, conversion to
+// the output formats, encoding and decoding of inputs. Each is called as the pipeline of a tile calls it, on one
+// thread, and counted in bytes of its input against memcpy of as many bytes in the same run. No MPI; half a minute.
 //   bench_kernels [--json FILE] [--table FILE] [--benchmark_filter=REGEX and other options of Google Benchmark]
 // For example --benchmark_filter='memcpy|encode', with memcpy, as others are compared with it. Times are of the
 // thread's CPU, medians over repetitions that are interleaved at random, so that what else the machine does disturbs
@@ -35,7 +35,7 @@ using dfb::Fragment;
 using dfb::OutputFormat;
 using dfb::WireFormat;
 
-// What is read "from memory" is this much, several times what caches hold, of which each call gets the next piece.
+// Kernels "from memory" read this much, several times the size of the caches; each call gets the next piece.
 constexpr std::size_t memoryBytes = std::size_t{64} << 20;
 
 enum class From { Cache, Memory };
@@ -62,8 +62,8 @@ std::vector<Kernel>& kernels()
 
 using Function = std::function<void(benchmark::State&)>;
 
-// `make` gives the function to be measured. It is called when that is needed first: one kernel's pixels are no good for
-// another, and all of them are many.
+// `make` returns the function to be measured. It is called when the function is first needed, because each kernel has
+// pixels of its own, and those of all kernels are many.
 benchmark::internal::Benchmark* measure(const Kernel& kernel, std::function<Function()> make)
 {
     kernels().push_back(kernel);
@@ -193,8 +193,8 @@ public:
         std::vector<int> places(count_);
         Random random(1);
         for (std::size_t t = 0; t < tiles; ++t) {
-            // Who is in front has nothing to do with who came first, neither with the order of the memory. Coherent
-            // depths: surfaces at an angle to each other, one behind the other.
+            // The order of depth is independent of the order of arrival and of the order in memory. Coherent depths:
+            // surfaces at an angle to each other, one behind the other.
             std::iota(places.begin(), places.end(), 0);
             std::shuffle(places.begin(), places.end(), random.engine());
             for (const int place : places) {
@@ -419,8 +419,8 @@ std::string wireName(const char* what, int side, WireFormat format, const Activi
            + nameOf(from);
 }
 
-// A full tile is compared with memcpy. One that is not should cost as much less than that as it has fewer active
-// pixels; of none, and of those that lie apart, no such thing can be asked.
+// A full tile is compared with memcpy. A tile with fewer active pixels should cost less in proportion; there is no
+// target for one without active pixels, or with scattered ones.
 void compare(Kernel& kernel, const char* what, int side, WireFormat format, const Activity& activity, From from)
 {
     if (activity.percent == 100) {
@@ -449,7 +449,7 @@ void measureEncoding(WireFormat format, const Activity& activity, From from)
                 fillTile(tile, activity, 4);
             else
                 tile = tiles->front();
-        // As long as messages are kept others are written elsewhere, so that what is written is not in a cache either.
+        // Messages are kept, so that others are written elsewhere, and the written memory is not in a cache either.
         const auto messages = std::make_shared<std::vector<Buffer>>();
         for (const WireTile<Side>& tile : *tiles)
             messages->push_back(encode(tile, format));

@@ -1,5 +1,5 @@
-// What the messaging layer costs beside plain MPI: latency and bandwidth, the processor time of waiting, what is taken
-// from a thread that computes, and how messages move when there are more ranks than cores.
+// What the messaging layer costs, compared with plain MPI: latency and bandwidth, the processor time of waiting, the
+// time that a computing thread loses, and how messages move when there are more ranks than cores.
 //   mpirun -n 2 bench_messaging        or -n 8; --quick; a list of parts such as 14 runs only those
 // --trace FILE: of what goes with credit in part 1; the other messages are below what a trace is told of.
 #include "baselines.hpp"
@@ -29,12 +29,12 @@ using dfb::detail::MessageKind;
 constexpr std::size_t tileBytes = 64 * 64 * 5 * sizeof(float); // colour and depth
 constexpr std::array<Waiting, 3> waitings{Waiting::Blocking, Waiting::Yield, Waiting::Nap};
 
-// A receiver that expects messages as long as it lives: what an open frame is to a connection.
+// A receiver that expects messages as long as it lives. To a connection it looks like an open frame.
 class Endpoint final : private dfb::detail::MessageReceiver {
 public:
     using OnMessage = std::function<void(int source, const MessageHeader&, Buffer&&)>;
 
-    // To be made, and gone, in the same order on all ranks. `onMessage` is called by the progress thread.
+    // It must be made, and destroyed, in the same order on all ranks. `onMessage` is called by the progress thread.
     Endpoint(Connection& connection, OnMessage onMessage) : connection_(connection), onMessage_(std::move(onMessage))
     {
         connection_.expectMessages(true);
@@ -388,7 +388,7 @@ void latencyAndBandwidth(const Group& pair, bool quick, const bench::Trace& trac
     }
 }
 
-// ---- what is going on in a process beside a thread that does something else, for parts 2 and 3
+// ---- what a process does besides a thread that does something else, for parts 2 and 3
 
 // A thread in plain MPI that waits for a message, until the rank before this one is done as well.
 class PlainWaiter {

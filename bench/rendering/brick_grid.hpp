@@ -30,7 +30,7 @@ struct BrickGrid {
         return {static_cast<float>(cells[0]), static_cast<float>(cells[1]), static_cast<float>(cells[2])};
     }
 
-    // Of a brick, where all are in a box from 0 to `extent`. Neighbours have the same face, bit for bit.
+    // The box of a brick, if all bricks fill a box from 0 to `extent`. Neighbours share a face, bit for bit.
     dfb::Box3 box(int brick, const dfb::Vec3& extent) const
     {
         const std::array<int, 3> at{brick % cells[0], brick / cells[0] % cells[1], brick / (cells[0] * cells[1])};

@@ -73,7 +73,7 @@ public:
     }
 
 private:
-    // A turbulent field, the same whoever makes which part of it.
+    // A turbulent field, which is the same whichever rank makes a part of it.
     static float field(const dfb::Vec3& p)
     {
         float sum = 0, weight = 0.5f, frequency = 3;
@@ -167,7 +167,7 @@ public:
         return {"rendering alone", [this](const MarchedView& view) { return (renderAll(view), now()); }};
     }
 
-    // dfb that is told the order, as IceT is. Ids of bricks are the ranks, so that places in the shared world are, too.
+    // dfb that gets the order, as IceT does. Ids of bricks are the ranks, so that places in the shared world are, too.
     MarchedSystem inOrder(const std::string& name)
     {
         const auto report = std::make_shared<dfb::FrameReport>();
@@ -183,7 +183,7 @@ public:
     }
 
     // All views one after the other, as one frame: up to config.framesInFlight are open at once, so that a rank that
-    // has rendered its part of one begins the next. Of the view that it is given nothing is used.
+    // has rendered its part of one begins the next. The view that it gets is not used.
     MarchedSystem inFlight(const std::string& name)
     {
         return {name,
@@ -204,7 +204,7 @@ public:
                 [this] { return ordered_->isDisplayRank() ? ordered_->image().rgba32f() : nullptr; }};
     }
 
-    // dfb as in the paper: what comes is sorted. Collective.
+    // dfb as in the paper: inputs are sorted by depth. Collective.
     MarchedSystem sorted(const std::string& name)
     {
         using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;

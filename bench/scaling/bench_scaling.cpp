@@ -87,7 +87,7 @@ std::unique_ptr<bench::Scene> sceneOf(const std::string& name, int ranks, int wi
 
 // ---- the formulas, see bench/README.md
 
-// What a rank has for one tile.
+// A rank's input for one tile.
 struct Input {
     int tile = 0;
     std::int64_t activePixels = 0, bytes = 0; // bytes of the message
@@ -144,7 +144,7 @@ struct Expected {
     }
 };
 
-// As blocks of the memory pool are: powers of 2, and the middles between them.
+// The size of the memory pool's block for so many bytes: powers of 2, and the middles between them.
 std::int64_t blockOf(std::int64_t bytes)
 {
     std::int64_t block = 64;
@@ -343,12 +343,12 @@ struct Network {
     double latency, overhead, gap, perByte;
 };
 
-// What a rank does in a phase that all go through.
+// The work of a rank in a phase of all ranks.
 struct Work {
     double out = 0, in = 0, outBytes = 0, inBytes = 0, cpu = 0;
 };
 
-// Until the slowest has sent and taken all.
+// The time until the slowest rank has sent and received all.
 double phase(const Network& n, const Work& w)
 {
     if (w.out + w.in == 0)

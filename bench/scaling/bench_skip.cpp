@@ -1,4 +1,4 @@
-// What a frame does not do: what it costs as less of the image is active, and which work is left out altogether. Each
+// The work that a frame skips: its cost as less of the image is active, and the work that is left out altogether. Each
 // claim is a line: what was measured, its limit, and whether it holds. 4 ranks are threads of this process; no MPI.
 //   bench_skip [--size 1024x1024] [--frames 11] [--quick] [--json FILE] [--svg FILE] [--table FILE] [--commit ID]
 //   bench_skip --frames-of full|empty [--frames N] [--size ...] [--trace FILE]
@@ -602,7 +602,8 @@ private:
         claim("16 inputs of a tile, the front one opaque: time of blending, % of that of translucent ones",
               100 * hidden / all, "%.1f", 50, Sort::Shown);
         claim("the front one opaque but for 1e-4, minTransmittance 1e-3", 100 * nearly / all, "%.1f", 50, Sort::Shown);
-        // Who is behind may hear of it too late. In the first frame nobody knows that something will be hidden.
+        // Ranks behind may learn too late that they are hidden. In the first frame no rank knows that it will be
+        // hidden.
         Settings s = settings();
         s.frames = 3;
         s.renderUs = 200;

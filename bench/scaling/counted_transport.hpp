@@ -1,6 +1,6 @@
-// CountedTransport: ranks as threads of one process, and what each of them sends and receives, by kind of message. What
-// is counted is what the library hands to the transport; MpiTransport then puts several messages of up to 8 KiB to one
-// rank into one packet, this one hands over each by itself.
+// CountedTransport: ranks as threads of one process; it counts what each of them sends and receives, by kind of
+// message. It counts the messages that the library gives to the transport. MpiTransport then puts several messages of
+// up to 8 KiB to one rank into one packet; this transport delivers each by itself.
 #pragma once
 
 #include <dfb/comm/inproc_transport.hpp>
@@ -39,7 +39,7 @@ struct MessageCount {
     }
 };
 
-// Of one rank. add() may be called from any thread.
+// The traffic of one rank. Any thread may call add().
 class Traffic {
 public:
     void add(Kind kind, std::size_t byteCount)
@@ -74,7 +74,7 @@ private:
     std::array<MessageCount, static_cast<std::size_t>(Kind::Leaving) + 1> counts_{};
 };
 
-// What ranks share that are counted: their traffic, and a place to meet without messages.
+// Shared by the counted ranks: their traffic, and a place to meet without messages.
 class Counters {
 public:
     explicit Counters(int ranks) : ranks_(ranks), sent(static_cast<std::size_t>(ranks)), received(sent.size()) {}

@@ -49,7 +49,7 @@ struct Box {
     }
 };
 
-// Points in front of the near plane are not visible. Where an edge crosses that plane, the crossing point counts.
+// Points nearer than the near plane are not visible. Where an edge crosses that plane, the crossing point counts.
 Box project(const std::vector<Vector>& clip, const Region& wall)
 {
     const auto before = [](const Vector& v) { return v[2] + v[3]; }; // 0 on the near plane
