@@ -325,15 +325,14 @@ private:
     // The pictures of all displays of this rank; under mutex_.
     std::shared_ptr<Pictures> picturesOf(std::int64_t frame)
     {
-        std::shared_ptr<Pictures>& pictures = coming_[frame];
-        if (!pictures) {
-            pictures = std::make_shared<Pictures>();
-            for (const auto& [d, shown] : shown_)
-                pictures->emplace(d, Picture{makeImage(), pixelsOfDisplay(),
-                                             std::vector<std::uint64_t>(static_cast<std::size_t>(layout_.displayHeight)
-                                                                        * wordsPerRow())});
-        }
-        return pictures;
+        if (const auto found = coming_.find(frame); found != coming_.end())
+            return found->second;
+        auto pictures = std::make_shared<Pictures>();
+        for (const auto& [d, shown] : shown_)
+            pictures->emplace(d, Picture{makeImage(), pixelsOfDisplay(),
+                                         std::vector<std::uint64_t>(static_cast<std::size_t>(layout_.displayHeight)
+                                                                    * wordsPerRow())});
+        return coming_.emplace(frame, std::move(pictures)).first->second;
     }
 
     // ---- how many pixels of a frame all ranks have sent to each display
@@ -391,9 +390,14 @@ private:
         mailbox_->receiveReduction(source, header, message);
     }
 
-    // Under mutex_: how many pixels have not come to a display of this rank, and whether no more will come.
-    std::int64_t pixelsLeft(std::int64_t frame, int display) { return picturesOf(frame)->at(display).pixelsLeft; }
-    bool hasAllSent(std::int64_t frame, int display)
+    // Under mutex_: how many pixels have not come to a display of this rank, and whether no more will come. These take
+    // no memory: a rank that has none left must not throw while others wait for it.
+    std::int64_t pixelsLeft(std::int64_t frame, int display) const
+    {
+        const auto found = coming_.find(frame);
+        return found == coming_.end() ? pixelsOfDisplay() : found->second->at(display).pixelsLeft;
+    }
+    bool hasAllSent(std::int64_t frame, int display) const
     {
         const auto found = allSent_.find(frame);
         return found != allSent_.end()
