@@ -248,6 +248,8 @@ public:
     }
     Region unpack(double number) const
     {
+        if (!(number >= 0 && number < double(std::uint64_t{1} << 52))) // a message can be damaged
+            return {};
         const auto bits = static_cast<std::uint64_t>(number);
         const auto side = [&](int shift) { return step_ * static_cast<int>(bits >> shift & 8191); };
         return {side(39), side(26), side(13), side(0)};

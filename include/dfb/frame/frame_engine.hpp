@@ -194,7 +194,7 @@ public:
     {
         if (tile < 0 || tile >= layout().tileCount())
             failArgument("noteMergeError() for tile %d of an image of %d tiles", tile, layout().tileCount());
-        figures_.addMergeError(tile, bound / samples(tile).count);
+        figures_.addMergeError(tile, bound / std::max(samples(tile).count, 1));
     }
 
     JobRange nextJobs(std::int64_t count) override

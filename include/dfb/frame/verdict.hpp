@@ -11,6 +11,7 @@
 #include <algorithm>
 #include <array>
 #include <chrono>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
@@ -378,8 +379,10 @@ public:
     // values.
     static std::vector<Figure> sums(std::vector<Figure> figures)
     {
-        std::sort(figures.begin(), figures.end(),
-                  [](const Figure& a, const Figure& b) { return a.key != b.key ? a.key < b.key : a.value < b.value; });
+        const auto isLess = [](double a, double b) { return std::isnan(b) ? !std::isnan(a) : a < b; }; // NaN is last
+        std::sort(figures.begin(), figures.end(), [&](const Figure& a, const Figure& b) {
+            return a.key != b.key ? a.key < b.key : isLess(a.value, b.value);
+        });
         return Verdict::summed(std::move(figures));
     }
 
