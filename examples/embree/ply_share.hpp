@@ -44,7 +44,7 @@ public:
             return false;
         for (std::size_t i = 0; i < begins.size(); ++i) {
             const PlyElement& element = reader_.elements()[i];
-            if (!element.isVertex() && !element.isFace())
+            if (element.count == 0 || (!element.isVertex() && !element.isFace()))
                 continue;
             const auto [first, end] = loaders_.shareOf(element.count);
             const std::uint64_t most = std::max<std::uint64_t>(1, (std::uint64_t{1} << 22) / rowBytes[i]);

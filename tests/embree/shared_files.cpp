@@ -347,6 +347,10 @@ TEST_CASE("A bad file that ranks read together is the error of one rank alone", 
               "property float y\nproperty float z\nelement face 1\n"
               "property list uchar int vertex_indices\nend_header\n"
                   + std::string(400, '\1')},
+             {"no_faces.ply",
+              "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+              "property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+                  + std::string(36, '\1')},
              {"empty.ply", ""},
              {"word.obj", with(obj, obj.size() / 2, "v 1 word 3\n")},
              {"index.obj", with(obj, obj.size() / 2, "f 1 2 99999\n")},
