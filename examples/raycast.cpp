@@ -13,6 +13,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
+#include <cstdlib>
 #include <cstring>
 #include <exception>
 #include <fstream>
@@ -149,6 +150,15 @@ private:
     std::vector<float> values_;
 };
 
+double numberOf(const char* text)
+{
+    char* end = nullptr;
+    const double number = std::strtod(text, &end);
+    if (end == text || *end != '\0')
+        throw std::runtime_error(std::string(text) + " is not a number");
+    return number;
+}
+
 // Cuts the cells [lower, upper) into `count` bricks, or fewer if cells run out, always across the longest side. Calls
 // `use(id, lower, upper)`.
 template <class Use>
@@ -221,22 +231,25 @@ try {
     if (argc > 1 && argv[1][0] == '-') {
         if (fb.isDisplayRank())
             std::printf("usage: raycast [VOLUME [FROM [BRICKS]]]\n"
-                        "  VOLUME  name_XxYxZ_TYPE.raw, TYPE: uint8, uint16 or float32 (a knot)\n"
-                        "  FROM    values below are transparent; a part of the range, 0 to 1 (0.15)\n"
-                        "  BRICKS  number of bricks (8)\n"
+                        "  VOLUME  name_XxYxZ_TYPE.raw, TYPE: uint8, uint16 or float32 (default: a knot)\n"
+                        "  FROM    values below this are transparent: 0 is the least value of the volume, 1 the\n"
+                        "          greatest (default: 0.15)\n"
+                        "  BRICKS  number of bricks (default: 8)\n"
                         "e.g.   mpirun -n 4 raycast head_256x256x128_uint8.raw 0.2\n");
         return 0;
     }
     const Volume volume = argc > 1 ? volumeOf(argv[1]) : Volume();
-    const float from = argc > 2 ? std::stof(argv[2]) : 0.15f;
-    const int count = argc > 3 ? std::stoi(argv[3]) : 8;
-    if (count < 1)
-        throw std::runtime_error("the number of bricks is at least 1");
+    const auto from = float(argc > 2 ? numberOf(argv[2]) : 0.15);
+    const double count = argc > 3 ? numberOf(argv[3]) : 8;
+    if (!(count >= 1 && count <= 1e6))
+        throw std::runtime_error("the number of bricks is 1 to 1000000");
 
+    int bricksOfAll = 0;
     std::vector<dfb::Brick> bricks; // of this rank
     std::vector<BrickVoxels> voxels;
     const Index last{volume.size[0] - 1, volume.size[1] - 1, volume.size[2] - 1};
-    cut({0, 0, 0}, last, 0, count, [&](int id, const Index& lower, const Index& upper) {
+    cut({0, 0, 0}, last, 0, int(count), [&](int id, const Index& lower, const Index& upper) {
+        ++bricksOfAll;
         if (id % fb.size() != fb.rank())
             return;
         const auto point = [](const Index& i) { return dfb::Vec3{float(i[0]), float(i[1]), float(i[2])}; };
@@ -268,7 +281,7 @@ try {
     const dfb::FrameReport report = loop.render(camera, render, frame);
     if (fb.isDisplayRank()) {
         dfb::writePpm("raycast.ppm", fb.image());
-        std::printf("wrote raycast.ppm: %d bricks on %d ranks, %.0f ms\n", count, fb.size(), report.totalMs);
+        std::printf("wrote raycast.ppm: %d bricks on %d ranks, %.0f ms\n", bricksOfAll, fb.size(), report.totalMs);
     }
 } catch (const std::exception& e) {
     std::fprintf(stderr, "raycast: %s\n", e.what());
