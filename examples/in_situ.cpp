@@ -275,10 +275,10 @@ constexpr const char* usage =
     "usage: in_situ [OPTION VALUE]...\n"
     "  --size N      voxels along each side of the grid (96)\n"
     "  --steps N     steps of the simulation (1600; with --live: until it is ended)\n"
-    "  --every N     steps from one picture to the next (80)\n"
-    "  --slabs N     parts of the grid, which are dealt out to the ranks (8)\n"
+    "  --every N     render a picture after every N steps (80)\n"
+    "  --slabs N     slabs that the grid is cut into, which are dealt out to the ranks (8)\n"
     "  --out PREFIX  pictures to write: PREFIX_0000.ppm, PREFIX_0001.ppm ... (in_situ; with --live: none)\n"
-    "  --live [PORT] show them in a browser on this machine (port 8080, or one that is free)\n"
+    "  --live [PORT] show the pictures in a browser on this machine (port 8080, or any free port)\n"
     "Exit code: 0: done, 1: the run failed, 2: the command line is wrong.\n";
 
 // Throws std::invalid_argument.

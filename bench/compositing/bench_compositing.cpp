@@ -390,7 +390,11 @@ Options optionsOf(int argc, char** argv)
         argc, argv,
         "usage: mpirun -n RANKS bench_compositing [--scene bricks,overlap,dense,one,empty|all] [--size WxH,...] "
         "[--frames N] [--systems dfb,icet,plain] [--moving] [--reader] [--only TEXT] [--json FILE] [--table FILE] "
-        "[--commit ID] [--trace FILE]",
+        "[--commit ID] [--trace FILE]\n"
+        "  --moving     each frame is seen from another side\n"
+        "  --reader     a rank reads the image within the time that is measured\n"
+        "  --only TEXT  only systems whose title has TEXT; several texts with | between them\n"
+        "  --commit ID  is written to the JSON file",
         {{"--scene", readScenes},
          {"--size", bench::readSizes(o.sizes)},
          {"--systems", readSystems},

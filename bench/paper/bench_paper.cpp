@@ -307,7 +307,10 @@ Options optionsOf(int argc, char** argv)
         "usage: mpirun -n RANKS bench_paper --figure 6|7|8|9|10 [--ranks N,...] [--size WxH,...] [--views N] "
         "[--repeats N] [--scale S] [--seed K] [--threads N] [--compress never|always|auto] [--check VIEWS] [--json "
         "FILE] [--svg FILE] "
-        "[--table FILE] [--ppm FILE] [--trace FILE] [--commit ID]";
+        "[--table FILE] [--ppm FILE] [--trace FILE] [--commit ID]\n"
+        "  --scale S      factor of the resolution of the data\n"
+        "  --check VIEWS  the images of so many views are compared with a reference\n"
+        "  --repeats N    frames of each view";
     bench::readOptions(
         argc, argv, usage,
         {{"--figure", number(o.figure, 6)},

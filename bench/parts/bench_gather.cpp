@@ -321,8 +321,10 @@ private:
 int main(int argc, char** argv)
 {
     const bench::Arguments arguments(argc, argv,
-                                     "usage: mpirun -n RANKS bench_gather [--quick] [--trace FILE] [PARTS]   PARTS: 1 "
-                                     "for 1024², 2 for 2048², 3 for 4096²");
+                                     "usage: mpirun -n RANKS bench_gather [--quick] [--trace FILE] [PARTS]\n"
+                                     "  --quick  fewer repetitions\n"
+                                     "  PARTS    1: images of 1024², 2: 2048², 3: 4096²; 12: the first two\n"
+                                     "           (default: all)");
     int level = 0;
     MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
     bench::shortenNaps();

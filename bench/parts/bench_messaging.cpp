@@ -792,7 +792,10 @@ int main(int argc, char** argv)
 {
     const bench::Arguments arguments(
         argc, argv,
-        "usage: mpirun -n RANKS bench_messaging [--quick] [--trace FILE] [PARTS]   2 ranks at least; PARTS as in 14");
+        "usage: mpirun -n RANKS bench_messaging [--quick] [--trace FILE] [PARTS]   2 ranks at least\n"
+        "  --quick  fewer repetitions\n"
+        "  PARTS    1: latency and bandwidth, 2: processor time of waiting, 3: time that a computing thread loses,\n"
+        "           4: more ranks than cores; 14: the first and the last (default: all)");
     int level = 0;
     MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
     bench::shortenNaps();

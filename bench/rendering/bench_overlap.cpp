@@ -254,7 +254,10 @@ Options optionsOf(int argc, char** argv)
     bench::readOptions(
         argc, argv,
         "usage: mpirun -n RANKS bench_overlap [--size WxH,...] [--views N] [--json FILE] [--table FILE] "
-        "[--commit ID] [--only TEXT] [--trace FILE] [--in-a-row TIMES]",
+        "[--commit ID] [--only TEXT] [--trace FILE] [--in-a-row TIMES]\n"
+        "  --only TEXT       only systems whose name has TEXT; several texts with | between them\n"
+        "  --in-a-row TIMES  renders all views so often without a pause, and gives the frames per second\n"
+        "  --commit ID       is written to the JSON file",
         {{"--size", bench::readSizes(o.sizes)},
          {"--views", [&o](const std::string& value) { return (o.views = std::atoi(value.c_str())) > 0; }},
          {"--in-a-row", [&o](const std::string& value) { return (o.inARow = std::atoi(value.c_str())) > 0; }},

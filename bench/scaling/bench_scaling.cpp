@@ -715,7 +715,11 @@ Options optionsOf(int argc, char** argv)
         argc, argv,
         "usage: bench_scaling [--ranks 2,4,...] [--size WxH, multiples of 64] [--scenes bricks,discs] [--frames N] "
         "[--quick] [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] [--table FILE] "
-        "[--trace FILE] [--commit ID]",
+        "[--trace FILE] [--commit ID]\n"
+        "  --rig, --hpc  a network of 1 Gbit/s and one of a cluster: latency, overhead and gap of a message in us, "
+        "and\n"
+        "                ns a byte\n"
+        "  --pixel-ns    processor time of an active pixel, in ns, with dfb and with plain loops",
         {{"--ranks", readRanks},
          {"--size", readSize},
          {"--scenes", readScenes},

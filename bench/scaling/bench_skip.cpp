@@ -661,7 +661,8 @@ Options optionsOf(int argc, char** argv)
         argc, argv,
         "usage: bench_skip [--size WxH] [--frames N] [--quick] [--json FILE] [--svg FILE] [--table FILE] [--commit "
         "ID]\n"
-        "       bench_skip --frames-of full|empty [--size WxH] [--frames N] [--trace FILE]",
+        "       bench_skip --frames-of full|empty [--size WxH] [--frames N] [--trace FILE]\n"
+        "  --frames-of  renders so many frames of a full or an empty image and measures nothing: for a profiler",
         {{"--size", readSize},
          {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
          {"--frames-of", readContent},

@@ -174,7 +174,7 @@ private:
         words(
             "--blend", options_.blend, {"sort", "order", "nearest"},
             "How the bricks at a pixel are combined: sorted by depth; in the order of the bricks from the eye, without "
-            "sorting or depth; or the nearest alone, for opaque scenes; default sort");
+            "sorting or depth; or only the nearest one, for opaque scenes; default sort");
         words("--distribution", options_.distribution, {"owned", "linear", "round-robin", "dynamic"},
               "Who renders which tile with --mode image: its owner, equal shares in order, one by one, or on demand; "
               "default owned");
@@ -208,7 +208,8 @@ private:
         flag("--verify", options_.verify,
              "Check each finished tile, also its depth and what --aux writes, against an exact reference; slow");
         words("--owner-map", options_.ownerMap, {"auto", "lattice", "linear", "hash"},
-              "Which rank owns which tile; default auto: lattice on one node, near the pixels on several");
+              "Which rank owns which tile; default auto: lattice on one node; on several, a rank near those that have "
+              "the tile's pixels");
         number("--in-flight", options_.inFlight, 1, 64, "N",
                "Frames under way at once: a rank that has rendered its part of one begins the next while others still "
                "render; default 1");
@@ -254,8 +255,8 @@ private:
         number("--exposure", options_.exposure, 0, 1e6, "E", "Tone-map with this factor, above 0; default 0: off");
         flag("--dither", options_.dither, "Dither the colour of a .png, so that gradients have no bands");
         number("--live", options_.live, -1, 65535, "[PORT]",
-               "Show it in a browser on this machine, where it can be turned: prints the address; port 0: any that is "
-               "free; default, without PORT: 8080, or any if that is taken");
+               "Show the scene in a browser on this machine, where you can turn it: prints the address; port 0: any "
+               "free port; default, without PORT: 8080, or any free port if that is taken");
     }
 
     void addCamera()
@@ -268,12 +269,12 @@ private:
         number("--aperture", options_.view.aperture, 0, 10, "R",
                "Radius of the lens of dof, in units of the largest extent of what there is to see; default 0.05");
         number("--focus", options_.view.focus, 1e-6, 1e6, "D",
-               "Distance of what is sharp with dof and at the screen with stereo, in the same units; default: the "
-               "centre's");
+               "Distance of what is sharp with dof and at the screen with stereo, in units of the largest extent of "
+               "what there is to see; default: the distance of --target");
         number("--shutter", options_.view.shutter, -360, 360, "DEG",
                "Degrees of the orbit that motion blurs, up to 360; default 8");
         number("--eyes", options_.view.separation, 0, 10, "D",
-               "Distance of the eyes of stereo, in the same units; default 0.1");
+               "Distance of the eyes of stereo, in units of the largest extent of what there is to see; default 0.1");
         number("--dome-angle", options_.view.domeAngle, 1, 360, "DEG",
                "Degrees that dome covers, up to 360; default 180");
         number("--azimuth", options_.view.azimuth, -36000, 36000, "DEG",

@@ -40,7 +40,7 @@ public:
             "The distance from the camera along the ray, as a greyscale .pfm, infinite where there is nothing; default "
             "none");
         add("--aux", files.aux, "PREFIX", {},
-            "Its auxiliary channels: PREFIX.normal.pfm, .albedo.pfm, .position.pfm, and .primitive.png and "
+            "Auxiliary channels of the picture: PREFIX.normal.pfm, .albedo.pfm, .position.pfm, and .primitive.png and "
             ".instance.png with a colour for each id; default none");
         add("--stats", files.stats, "FILE", {".json"},
             "Where the time went, in ms, on each rank and the slowest: total = load + render + compositing (with "
