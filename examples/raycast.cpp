@@ -42,10 +42,10 @@ Volume volumeOf(const std::string& path)
     volume.path = path;
     const std::string name = path.substr(path.find_last_of('/') + 1);
     const std::size_t first = name.find_last_of('_', name.find_last_of('_') - 1);
-    char type[8] = {};
+    char type[10] = {};
     Index& size = volume.size;
     if (first == std::string::npos
-        || std::sscanf(name.c_str() + first, "_%dx%dx%d_%7[a-z0-9]", &size[0], &size[1], &size[2], type) != 4
+        || std::sscanf(name.c_str() + first, "_%dx%dx%d_%9[a-z0-9]", &size[0], &size[1], &size[2], type) != 4
         || *std::min_element(size.begin(), size.end()) < 2)
         throw std::runtime_error(path + ": the name should end in sizes and type, such as _64x64x64_uint8.raw");
     volume.bytesPerVoxel = std::string(type) == "uint8" ? 1 : std::string(type) == "uint16" ? 2 : 4;
@@ -102,10 +102,14 @@ public:
             }
     }
 
+    // The least and the greatest value, of those that are finite.
     std::pair<float, float> range() const
     {
-        const auto ends = std::minmax_element(values_.begin(), values_.end());
-        return {*ends.first, *ends.second};
+        std::pair<float, float> ends{std::numeric_limits<float>::max(), std::numeric_limits<float>::lowest()};
+        for (const float value : values_)
+            if (std::isfinite(value))
+                ends = {std::min(ends.first, value), std::max(ends.second, value)};
+        return ends;
     }
 
     // Trilinear interpolation. Beyond the border of the volume the values of the outermost voxels continue.
@@ -210,7 +214,8 @@ struct RayCaster {
                 continue;
             const dfb::Vec3 gradient = voxels.gradientAt(p);
             const float slope = std::sqrt(dot(gradient, gradient)) + 1e-6f * (highest - lowest);
-            const float light = 0.35f + 0.65f * std::fabs(dot(gradient, direction)) / slope;
+            const float facing = std::fmax(std::fabs(dot(gradient, direction)) / slope, 0.0f); // 0 beside a NaN
+            const float light = 0.35f + 0.65f * facing;
             const float color[3] = {0.1f + 0.9f * value, 0.3f + 0.15f * value, 0.9f - 0.85f * value}; // blue to orange
             const float visible = (1 - rgba[3]) * opacity;
             for (int c = 0; c < 3; ++c)
@@ -262,6 +267,8 @@ try {
         range[1] = std::min(range[1], -brick.range().second);
     }
     MPI_Allreduce(MPI_IN_PLACE, range, 2, MPI_FLOAT, MPI_MIN, mpi.communicator());
+    if (range[0] > -range[1])
+        throw std::runtime_error(volume.path + ": no value is finite");
 
     const dfb::Vec3 center = 0.5f * dfb::Vec3{float(last[0]), float(last[1]), float(last[2])};
     const float away = 2.2f * std::sqrt(dot(center, center));
