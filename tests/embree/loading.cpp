@@ -211,6 +211,15 @@ TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
     for (const std::string& error :
          ofRanks<std::string>(3, [&](const Loaders& loaders) { return errorOf([&] { openVolume(none, loaders); }); }))
         CHECK(contains(error, none + ": not one of its voxels is finite"));
+    // Their extent is more than a float can hold, or so little that its reciprocal is: as of bytes in the wrong order.
+    for (const std::vector<float>& ends : {std::vector<float>{-3e38f, 3e38f}, {0, 1e-40f}}) {
+        std::vector<float> voxels(24, ends[0]);
+        voxels.back() = ends[1];
+        const std::string swapped = folder.write("s_2x3x4_float32.raw", bytesOf(voxels));
+        for (const std::string& error : ofRanks<std::string>(
+                 3, [&](const Loaders& loaders) { return errorOf([&] { openVolume(swapped, loaders); }); }))
+            CHECK((contains(error, swapped + ": its values go from ") && contains(error, "byte order")));
+    }
 }
 
 } // namespace loading_cases
