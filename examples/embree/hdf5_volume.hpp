@@ -98,7 +98,7 @@ public:
                                                         : H5T_NATIVE_FLOAT;
         if (H5Sselect_hyperslab(in.id(), H5S_SELECT_SET, start.data(), nullptr, size.data(), nullptr) < 0
             || H5Dread(data_.id(), type, memory.id(), in.id(), H5P_DEFAULT, out) < 0)
-            fail("reading failed at y=" + std::to_string(lo[1]) + " z=" + std::to_string(lo[2]));
+            fail("reading failed at y=" + std::to_string(lo[1]) + " z=" + std::to_string(lo[2]) + missingFilter());
     }
 
 private:
@@ -121,6 +121,24 @@ private:
         readExtent();
         readType();
     }
+
+    // "", or which filter of the data set this HDF5 library lacks.
+    std::string missingFilter() const
+    {
+        const Hdf5Object creation(H5Dget_create_plist(data_.id()), H5Pclose);
+        for (int i = 0; i < H5Pget_nfilters(creation.id()); ++i) {
+            unsigned flags = 0, config = 0;
+            std::size_t values = 0;
+            char name[64] = "";
+            const H5Z_filter_t filter = H5Pget_filter2(creation.id(), static_cast<unsigned>(i), &flags, &values,
+                                                       nullptr, sizeof name, name, &config);
+            if (H5Zfilter_avail(filter) <= 0)
+                return std::string(": this HDF5 library lacks the filter ") + name + " (" + std::to_string(filter)
+                       + "); HDF5_PLUGIN_PATH may say where it is";
+        }
+        return "";
+    }
+
     void close()
     {
         space_ = Hdf5Object();

@@ -48,6 +48,7 @@ std::vector<double> valuesOf(bool hasSign)
 struct Layout {
     std::vector<hsize_t> extent, chunk; // no chunk: all in one piece
     bool isPacked = false;
+    H5Z_filter_t filter = 0; // of the test's own
 };
 
 void write(const std::string& file, const std::string& name, const std::vector<double>& values, hid_t type,
@@ -61,6 +62,8 @@ void write(const std::string& file, const std::string& name, const std::vector<d
         H5Pset_chunk(made, static_cast<int>(layout.chunk.size()), layout.chunk.data());
     if (layout.isPacked)
         H5Pset_deflate(made, 4);
+    if (layout.filter != 0)
+        H5Pset_filter(made, layout.filter, H5Z_FLAG_MANDATORY, 0, nullptr);
     const hid_t data = H5Dcreate2(f, name.c_str(), type, space, links, made, H5P_DEFAULT);
     REQUIRE(data >= 0);
     CHECK(H5Dwrite(data, H5T_NATIVE_DOUBLE, H5S_ALL, H5S_ALL, H5P_DEFAULT, values.data()) >= 0);
@@ -151,6 +154,13 @@ TEST_CASE("What is wrong with an HDF5 file is one line, the same on all ranks", 
         std::ifstream stream(folder / "good.h5", std::ios::binary);
         return std::string(std::istreambuf_iterator<char>(stream), {});
     }();
+    const auto asItIs = [](unsigned, std::size_t, const unsigned*, std::size_t bytes, std::size_t*, void**) {
+        return bytes;
+    };
+    const H5Z_class2_t filter{H5Z_CLASS_T_VERS, 300, 1, 1, "ours", nullptr, nullptr, asItIs};
+    H5Zregister(&filter);
+    write(folder / "filtered.h5", "d", values, H5T_IEEE_F32LE, {{2, 3, 4}, {2, 3, 4}, false, filter.id});
+    H5Zunregister(filter.id); // those who read it do not have it
     folder.write("text.h5", "no HDF5 file\n");
     folder.write("empty.h5", "");
     folder.write("cut.h5", good.substr(0, good.size() / 2));
@@ -164,6 +174,7 @@ TEST_CASE("What is wrong with an HDF5 file is one line, the same on all ranks", 
              {"flat.h5:d", "expected a data set with three axes of 2 to 65536 values, got 24"},
              {"two.h5:/d", "got 4x6"},
              {"four.h5:/d", "got 2x2x2x2"},
+             {"filtered.h5:/d", "this HDF5 library lacks the filter ours (300)"},
              {"text.h5:/d", "cannot be opened as an HDF5 file"},
              {"empty.h5:/d", "cannot be opened"},
              {"cut.h5:/a/b", ": "},
