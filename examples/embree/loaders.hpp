@@ -1,6 +1,8 @@
 // Loaders: the ranks that load a scene together. Each reads a part of the files, and all come to the same scene.
 #pragma once
 
+#include "text.hpp"
+
 #include <algorithm>
 #include <array>
 #include <cstddef>
@@ -70,7 +72,7 @@ public:
             const std::vector<T> values = step();
             add(values.data(), values.size() * sizeof(T));
         } catch (const std::exception& e) {
-            const std::string text = e.what();
+            const std::string text = reasonOf(e);
             own.assign(1, std::byte{1});
             add(text.data(), text.size());
         }

@@ -1,6 +1,8 @@
 // onAllRanks(): a step of all ranks, after which they know whether it has succeeded on all.
 #pragma once
 
+#include "text.hpp"
+
 #include <dfb/frame.hpp>
 
 #include <cstdio>
@@ -19,7 +21,7 @@ bool onAllRanks(FrameBuffer& fb, const Step& step)
     try {
         step();
     } catch (const std::exception& e) {
-        error = e.what();
+        error = reasonOf(e);
         failed = true;
     }
     const auto lowest = fb.allReduce({failed ? fb.rank() : fb.size()}, dfb::Reduce::Min).front();

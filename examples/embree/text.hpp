@@ -4,6 +4,8 @@
 #include <algorithm>
 #include <charconv>
 #include <cstddef>
+#include <exception>
+#include <new>
 #include <string>
 #include <string_view>
 #include <system_error>
@@ -13,6 +15,13 @@ namespace example {
 
 // Lines for the user. Each says what may differ from what the file, or an option, was meant to say.
 using Notes = std::vector<std::string>;
+
+// What an exception says; if memory is lacking, also what helps.
+inline std::string reasonOf(const std::exception& e)
+{
+    const bool lacksMemory = dynamic_cast<const std::bad_alloc*>(&e) != nullptr;
+    return std::string(e.what()) + (lacksMemory ? ": too little memory; of several ranks each needs less" : "");
+}
 
 // The ending of a path, with its dot; empty if there is none.
 inline std::string endingOf(const std::string& path) { return path.substr(std::min(path.rfind('.'), path.size())); }
