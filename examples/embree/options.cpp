@@ -326,9 +326,9 @@ private:
 
     void refuseContradictions() const
     {
-        for (const char* other :
-             {"--frames", "--output", "--png-bits", "--layers", "--cinema", "--alpha", "--depth", "--aux", "--stats",
-              "--trace", "--wall", "--exposure", "--adaptive", "--interleave", "--deep", "--verify", "--in-flight"})
+        for (const char* other : {"--frames", "--output", "--png-bits", "--layers", "--cinema", "--alpha", "--depth",
+                                  "--aux", "--stats", "--trace", "--wall", "--exposure", "--adaptive", "--interleave",
+                                  "--deep", "--verify", "--in-flight", "--save-options"})
             refuse(options_.live.has_value(), other, "does not go with --live");
         refuse(options_.live && options_.blend != Blending::Sort, "--blend",
                "order or nearest does not go with --live");
@@ -469,7 +469,8 @@ std::string optionsText(const std::vector<std::string>& scene,
     json["scene"] = scene;
     for (const auto& [name, text] : given)
         json[name] = detail::valueOf(text);
-    return json.dump(2) + '\n';
+    using Json = nlohmann::ordered_json; // file names may have any bytes
+    return json.dump(2, ' ', false, Json::error_handler_t::replace) + '\n';
 }
 
 } // namespace example

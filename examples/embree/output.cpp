@@ -298,6 +298,10 @@ void writeText(const std::string& path, const std::string& text)
         detail::failToWrite(path, std::strerror(errno));
 }
 
-void writeStats(const std::string& path, const RunStats& run) { writeText(path, toJson(run).dump(2) + '\n'); }
+void writeStats(const std::string& path, const RunStats& run)
+{
+    using Json = nlohmann::ordered_json; // file names may have any bytes
+    writeText(path, toJson(run).dump(2, ' ', false, Json::error_handler_t::replace) + '\n');
+}
 
 } // namespace example

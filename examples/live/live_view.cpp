@@ -430,7 +430,7 @@ private:
         json["frame"] = nullptr;
         if (shown)
             json["frame"] = toJson(*shown);
-        response.set_content(json.dump(), "application/json");
+        response.set_content(json.dump(-1, ' ', false, Json::error_handler_t::replace), "application/json");
     }
 
     static Json toJson(const LiveCamera& camera)

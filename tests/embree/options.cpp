@@ -263,6 +263,7 @@ TEST_CASE("The camera's place and the look arrive", "[options]")
     checkRefused({"--cinema", "a.cdb", "--output", "a.png"});
     checkRefused({"--save-options", "a.toml"});
     checkRefused({"--save-options", "a_%d.json"});
+    checkRefused({"--live", "--save-options", "a.json"});
     for (const std::string word : {"a.ply:isovalue=3", "a.obj:transfer=grey", "a.ply:opacity=2", "a.ply:gloss=2",
                                    "a_2x2x2_uint8.raw:transfer=rainbow"}) {
         const ParsedOptions parsed = parse({word});
