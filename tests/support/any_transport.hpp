@@ -1,4 +1,4 @@
-// AnyTransport: the transport that a communicator names at run time, so that a case is compiled once for all.
+// AnyTransport: a transport whose type is chosen at run time by its communicator, so that a case is compiled only once.
 #pragma once
 
 #include <dfb/comm/connection.hpp>
@@ -18,7 +18,7 @@ public:
         std::function<dfb::Progress(dfb::Progress)> resolved;
         bool isInProcess = false;
 
-        // `communicator` must outlive what is made with it.
+        // `communicator` must outlive the result and every transport that is made with it.
         template <class Transport>
         static Communicator of(const typename Transport::Communicator& communicator, bool isInProcess)
         {
@@ -63,7 +63,7 @@ public:
         return link_->blockAt(other, place, byteCount);
     }
     int sharingRanks() const { return link_->sharingRanks(); }
-    void abort(const std::string& text) { link_->abort(text); } // does nothing where the job cannot be ended
+    void abort(const std::string& text) { link_->abort(text); } // does nothing if the transport cannot end the job
 
 private:
     std::unique_ptr<dfb::Link> link_;

@@ -1,4 +1,4 @@
-// The scene with auxiliary channels.
+// The random scene with auxiliary channels: normal, albedo, position, primitive and instance id.
 #pragma once
 
 #include "random_scene.hpp"
@@ -10,7 +10,7 @@
 
 namespace frame_cases {
 
-// What a sample of the scene has beside colour and depth.
+// The auxiliary channels of a sample of the scene.
 inline dfb::testing::AuxSample auxOf(const scene::Scene& s, const dfb::testing::Sample& sample, int pass, int x, int y)
 {
     const std::uint64_t h = scene::mix(scene::mix(s.seed * 77 + sample.source) + static_cast<std::uint64_t>(pass) * 7919
@@ -23,7 +23,7 @@ inline dfb::testing::AuxSample auxOf(const scene::Scene& s, const dfb::testing::
         a.albedo[c] = sample.rgba[3] * std::fabs(part(shift + 24));
         a.position[c] = 10.0f * part(shift + 8);
     }
-    if (h % 3 != 0) // a volume has none
+    if (h % 3 != 0) // a third of the samples have no primitive id, as in a volume
         a.primitiveId = static_cast<std::uint32_t>(h >> 40);
     a.instanceId = sample.source;
     return a;
@@ -46,7 +46,7 @@ void renderWithAux(const scene::Scene& s, const dfb::Brick& brick, Tile& tile)
             }
 }
 
-// Values of the auxiliary channels of an image that are off.
+// Number of wrong values in the auxiliary channels of an image.
 inline std::size_t wrongAux(const scene::Scene& s, const dfb::Image& image)
 {
     const auto expected =

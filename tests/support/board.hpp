@@ -1,5 +1,5 @@
-// A board that all messages of in-process ranks pass: tests watch them there, hold them back, lose, repeat or change
-// them. And a time limit for all that runs over it.
+// A board through which all messages of in-process ranks pass. Tests use it to watch messages, hold them back, lose,
+// repeat or change them. runOn() also sets a time limit for everything that runs over a board.
 #pragma once
 
 #include "forward.hpp"
@@ -31,12 +31,12 @@ namespace board {
 
 using dfb::detail::MessageHeader;
 
-// What happens to the messages of all ranks; and the end of it all when time is up.
+// Decides what happens to the messages of all ranks, and makes all ranks fail when the time is up.
 struct Board {
     enum class What { Pass, Hold, Lose, Twice, CopyHeld };
     // Called for each message to another rank, from any thread.
     std::function<What(int from, int to, const MessageHeader&, dfb::Buffer&)> inspect;
-    // Called when it has been passed on.
+    // Called after a message has been passed on.
     std::function<void(int from, int to, const MessageHeader&)> passed;
 
     std::mutex mutex;
@@ -46,7 +46,7 @@ struct Board {
     std::atomic<bool> timeIsUp{false};
     std::shared_ptr<dfb::MemoryPool> pool = dfb::MemoryPool::create();
 
-    // Until release().
+    // Keeps `send` until release() is called; after that, calls it at once.
     void hold(std::function<void()> send)
     {
         std::unique_lock<std::mutex> lock(mutex);
@@ -68,7 +68,7 @@ struct Board {
         for (const auto& send : all)
             send();
     }
-    // Every rank that waits gets a TransportError.
+    // Every rank that is waiting gets a TransportError.
     void giveUp()
     {
         timeIsUp = true;
@@ -138,8 +138,8 @@ private:
     std::shared_ptr<Board> board_;
 };
 
-// runRanks() over a board, for at most so long. Throws std::runtime_error if anything came out of it but what `body`
-// has seen, or if time was up. Several may run at once: makes no use of Catch.
+// Calls runRanks() over a board and gives up after `limit`. Throws std::runtime_error if an exception leaves runRanks()
+// or if time was up. Does not use Catch, so several may run at once.
 inline void runOn(const std::shared_ptr<Board>& board, int ranks,
                   const std::function<void(const BoardTransport::Communicator&)>& body,
                   std::optional<std::uint64_t> shuffleSeed = std::nullopt,
@@ -169,9 +169,9 @@ inline void runOn(const std::shared_ptr<Board>& board, int ranks,
         throw std::runtime_error(thrown);
 }
 
-// Runs all cases at once, each for itself: most of the time they wait. All again if the process stood still meanwhile.
-// Then checks what came of them, one by one.
-// `run(item)` makes no use of Catch, `check(item, result)` may.
+// Runs all items at the same time, each on a thread of its own, as most of them wait most of the time. Runs all of them
+// again if the process stood still meanwhile. Then checks the results one by one. `run(item)` must not use Catch;
+// `check(item, result)` may.
 template <class Item, class Run, class Check>
 void eachAtOnce(const std::vector<Item>& items, const Run& run, const Check& check)
 {

@@ -1,6 +1,6 @@
-# Sourced by scripts of tests that drive Debian's Chromium, with their arguments. The caller sets script (its path in the
-# tree), root (the working tree) and packages (of npm, each NAME@VERSION). Takes --only-if-installed from the arguments:
-# then exits with 77 where something is missing; else installs it. Sets modules: the folder that has the packages.
+# Sourced, with their arguments, by scripts of tests that drive Debian's Chromium. The caller sets script (its path in
+# the tree), root (the working tree) and packages (of npm, each NAME@VERSION). With the argument --only-if-installed,
+# exits with 77 if something is missing; otherwise installs it. Sets modules: the folder of the npm packages.
 # shellcheck shell=sh disable=SC2154
 
 modules=${DFB_LIVE_NODE_MODULES:-}

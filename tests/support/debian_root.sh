@@ -1,6 +1,6 @@
-# Sourced by scripts of tests: a Debian system in a folder, for programs whose packages bring an MPI that would take the
-# place of this machine's. The caller sets script (its name), source (the working tree),
-# root (where the system is) and output (where results go).
+# Sourced by scripts of tests. Makes a Debian system in a folder, for programs whose packages bring an MPI that would
+# replace the one of this machine. The caller sets script (its name), source (the working tree), root (the folder of the
+# system) and output (the folder of the results).
 # shellcheck shell=sh disable=SC2034,SC2154
 
 say() {
@@ -17,7 +17,7 @@ give_up() {
     exit 1
 }
 
-# read_options ARGUMENT...: --root and --output into $root and $output; --help is the comment at the caller's start.
+# read_options ARGUMENT...: puts --root and --output into $root and $output. --help prints the head of the caller.
 read_options() {
     while [ $# -gt 0 ]; do
         case $1 in
@@ -26,7 +26,7 @@ read_options() {
                 say "$1 needs a folder"
                 exit 2
             fi
-            # A path that holds wherever the script goes.
+            # An absolute path is valid wherever the script changes to.
             case $2 in
             /*) path=$2 ;;
             *) path=$PWD/$2 ;;
@@ -46,8 +46,8 @@ read_options() {
     done
 }
 
-# isolate ARGUMENT...: runs the calling script again, with these arguments, where its mounts and processes are its own:
-# they are gone when it ends, however it ends. Returns if it runs there already.
+# isolate ARGUMENT...: runs the calling script again with these arguments, with mounts and processes of its own, which
+# are gone when it ends, however it ends. Returns if the script already runs so.
 isolate() {
     [ "${DFB_ISOLATED:-}" != yes ] || return 0
     [ "$(id -u)" -eq 0 ] || skip "it makes a system in a folder, which only root can"
@@ -62,7 +62,7 @@ isolate() {
     exec unshare --mount --pid --fork --kill-child --mount-proc sh "$0" "$@"
 }
 
-# Where this machine has its packages from, its release, and the archive's components, separated by commas.
+# Prints the address of this machine's package archive, its release, and its components, separated by commas.
 package_source() {
     # shellcheck disable=SC1091 # Debian's
     codename=$(. /etc/os-release && echo "${VERSION_CODENAME:-}")
@@ -87,25 +87,25 @@ make_root() {
     rm -rf --one-file-system "$root.new"
     debootstrap --variant=minbase --components="$3" "$2" "$root.new" "$1" >"$root.log" 2>&1 ||
         give_up "debootstrap failed: see $root.log"
-    echo force-unsafe-io >"$root.new/etc/dpkg/dpkg.cfg.d/fast" # a root that breaks is made again
+    echo force-unsafe-io >"$root.new/etc/dpkg/dpkg.cfg.d/fast" # if the system breaks, it is made again
     echo "127.0.0.1 localhost" >"$root.new/etc/hosts"
     mv "$root.new" "$root"
     rm "$root.log"
 }
 
-# in_root COMMAND...: runs it there, with nothing of this environment.
+# in_root COMMAND...: runs a command in the system, without the environment of this script.
 in_root() {
     chroot "$root" /usr/bin/env -i PATH=/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8 \
         OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1 "$@"
 }
 
-# with_display COMMAND...: runs it there with an X server. A server that resets itself when a client leaves refuses the
-# next one meanwhile.
+# with_display COMMAND...: runs a command in the system with an X server. Needs -noreset: a server that resets itself
+# when a client leaves refuses the next client meanwhile.
 with_display() {
     in_root xvfb-run -a -s "-screen 0 1280x1024x24 -nolisten tcp -noreset" "$@"
 }
 
-# install_there PACKAGE...: with apt; a package may be a file, too.
+# install_there PACKAGE...: installs packages in the system with apt; a package may also be a file.
 install_there() {
     say "installing there: $*"
     { in_root dpkg --configure -a && in_root apt-get -q update && in_root DEBIAN_FRONTEND=noninteractive apt-get -y -q install \
@@ -113,7 +113,7 @@ install_there() {
         give_up "packages cannot be installed: see $root/packages.log"
 }
 
-# enter_root PACKAGE...: makes the system in the folder $root if it is not there, and installs what it lacks.
+# enter_root PACKAGE...: makes the system in $root if there is none, and installs the packages that it lacks.
 enter_root() {
     [ -e "$root/etc/debian_version" ] || make_root
     for folder in dev sys; do
@@ -132,14 +132,14 @@ enter_root() {
     fi
 }
 
-# Copies the working tree to /dfb there. Files keep their times, so that only what has changed is compiled again.
+# Copies the working tree to /dfb in the system. Files keep their times, so that only changed ones are compiled again.
 copy_tree() {
     rm -rf --one-file-system "$root/dfb"
     mkdir "$root/dfb"
     tar -C "$source" -c --one-file-system --exclude=./build --exclude=./.git --exclude="./${root#"$source"/}" . | tar -C "$root/dfb" -x
 }
 
-# build_tree TARGET...: builds them there, in /build.
+# build_tree TARGET...: builds the targets in the system, in /build.
 build_tree() {
     say "building $*"
     {

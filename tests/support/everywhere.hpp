@@ -1,8 +1,8 @@
-// Everywhere: runs a case on 1, 2, 3, 4 and 7 ranks in one process (test_inproc), or on all ranks of MPI and on one in
-// this process (test_mpi); the image must be the same bit for bit.
+// Everywhere: runs a case on 1, 2, 3, 4 and 7 ranks in one process (test_inproc), or on all ranks of MPI and on one
+// rank in this process (test_mpi). All images must be the same bit for bit.
 //
 // A case has   template <class Transport> static Result run(const typename Transport::Communicator&);
-// which is called on each rank, makes no use of Catch, and takes a second at most. Transport is AnyTransport.
+// It is called on each rank, must not use Catch, and takes at most a second. Transport is AnyTransport.
 #pragma once
 
 #include "any_transport.hpp"
@@ -17,7 +17,7 @@
 namespace frame_cases {
 
 struct Result {
-    std::string wrong;      // "" or what is
+    std::string wrong;      // empty if nothing is wrong
     std::uint64_t hash = 0; // of the image, on the display rank
 
     void expect(bool condition, const std::string& what)
@@ -29,7 +29,7 @@ struct Result {
 
 using Run = Result (*)(const AnyTransport::Communicator&);
 
-// What rank 0 had, with what was wrong on any.
+// Returns the result of rank 0, with the errors of all ranks.
 inline Result inProcess(Run run, int ranks)
 {
     Result first;
@@ -52,8 +52,8 @@ inline Result inProcess(Run run, int ranks)
     return first;
 }
 
-// Of the program: run/inproc.cpp or run/mpi.cpp. `atOnce`: with all numbers of ranks at once, for a case that mostly
-// waits.
+// Defined in everywhere_inproc.cpp and everywhere_mpi.cpp; each test program links one of them. In one process,
+// `atOnce` runs all numbers of ranks at the same time, for a case that mostly waits.
 void runEverywhere(Run run, bool atOnce);
 
 } // namespace frame_cases

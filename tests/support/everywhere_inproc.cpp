@@ -1,4 +1,4 @@
-// Runs the cases with ranks in this process.
+// Runs the cases of everywhere.hpp on 1, 2, 3, 4 and 7 ranks in this process.
 #include "everywhere.hpp"
 #include "undisturbed.hpp"
 
@@ -10,7 +10,7 @@ void frame_cases::runEverywhere(Run run, bool atOnce)
 {
 #if defined(__has_feature)
 #if __has_feature(thread_sanitizer)
-    atOnce = false; // with it a case that mostly waits mostly computes
+    atOnce = false; // with it, a case that mostly waits mostly computes instead
 #endif
 #endif
     const std::vector<int> counts{1, 2, 3, 4, 7};
@@ -19,7 +19,7 @@ void frame_cases::runEverywhere(Run run, bool atOnce)
     for (const int ranks : counts)
         results.push_back(std::async(atOnce ? std::launch::async : std::launch::deferred,
                                      [=] { return undisturbed([=] { return inProcess(run, ranks); }, again); }));
-    std::uint64_t hash = 0; // with one rank
+    std::uint64_t hash = 0; // of the run with one rank
     for (std::size_t i = 0; i < counts.size(); ++i) {
         const Result result = results[i].get();
         if (i == 0)

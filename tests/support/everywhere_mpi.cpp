@@ -1,4 +1,4 @@
-// Runs the cases over MPI.
+// Runs the cases of everywhere.hpp on all ranks of MPI_COMM_WORLD.
 #include "everywhere.hpp"
 #include "ranks.hpp"
 
@@ -7,7 +7,7 @@
 
 void frame_cases::runEverywhere(Run run, bool)
 {
-    // With one rank in this process, to compare with, at the same time: some cases mostly wait.
+    // Meanwhile, rank 0 runs the case on one rank in this process and compares the images. Some cases mostly wait.
     std::future<Result> one;
     const bool isFirst = rankIn(MPI_COMM_WORLD) == 0;
     if (isFirst)

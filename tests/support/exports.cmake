@@ -1,5 +1,5 @@
 # cmake -DLIBRARY=libdfb_icet.so -DEXPORTS=exports.map -DCOUNT=49 -DNM=nm -P exports.cmake
-# The library shows the COUNT functions of exports.map and nothing else.
+# Checks that the library exports exactly the functions of exports.map, and that these are COUNT.
 file(STRINGS ${EXPORTS} wanted REGEX "^ +[A-Za-z0-9_]+;$")
 list(TRANSFORM wanted REPLACE "[ ;]" "")
 execute_process(COMMAND ${NM} -D --defined-only ${LIBRARY} OUTPUT_VARIABLE lines COMMAND_ERROR_IS_FATAL ANY)

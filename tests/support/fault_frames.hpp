@@ -1,5 +1,5 @@
-// Frames over a transport that disturbs messages: each must end in the right image or in an error of dfb, the same on
-// every rank as long as the ranks can still talk. What is done to the messages follows from a seed.
+// Frames over a transport that disturbs messages. Each frame must end in the right image or in an error of dfb, which
+// is the same on every rank as long as the ranks can still communicate. A seed decides what is done to the messages.
 #pragma once
 
 #include "random_scene.hpp"
@@ -22,13 +22,13 @@
 
 namespace scene {
 
-// What a seed stands for.
+// The configuration of some frames, which follows from a seed.
 struct FaultGroup {
     std::uint64_t seed = 0;
     int ranks = 2;
-    bool harmless = false; // nothing is lost or damaged: all frames must be right
+    bool harmless = false; // nothing is lost or damaged, so all frames must be right
     enum class Op { Sorted, Ordered, Nearest, Average, Deep, Accumulated } op = Op::Sorted;
-    Loop loop = Loop::Listing3; // of Op::Sorted; the others have one each
+    Loop loop = Loop::Listing3; // for Op::Sorted; each other operation has one loop
     Scene scene;
     dfb::testing::FaultOptions faults;
 };
@@ -60,8 +60,8 @@ inline FaultGroup faultGroup(std::uint64_t seed)
     g.harmless = g.faults.drop + g.faults.corrupt == 0;
     g.scene.timeout = std::chrono::milliseconds(g.harmless ? 20000 : 80);
     g.scene.allowPartial = pick(54, 3) == 0;
-    // Left alone is what makes the framebuffer, as no frame's time-out covers it; and the word of a rank that it gives
-    // up, which a transport that still works at all delivers.
+    // Two kinds of messages are left alone. Those of reduce() construct the framebuffer, and no frame's time-out covers
+    // them. Those that say that a rank gives up would be delivered by any transport that still works at all.
     g.faults.only = [](int, const dfb::Buffer& message) {
         const auto header = dfb::detail::loadAs<dfb::detail::MessageHeader>(message.data());
         if (header.kind != dfb::detail::MessageKind::ReduceUp && header.kind != dfb::detail::MessageKind::ReduceDown)
@@ -71,7 +71,7 @@ inline FaultGroup faultGroup(std::uint64_t seed)
     return g;
 }
 
-// Ends the process if it lives too long, and says what it was.
+// Aborts the process after 60 seconds and prints `what`.
 class Limit {
 public:
     explicit Limit(std::string what)
@@ -97,11 +97,11 @@ private:
 };
 
 struct FaultEnding {
-    std::string text;      // as of outcomeOf(); "partial" and why, if that is what the image is
-    std::size_t wrong = 0; // values, on the display rank
+    std::string text;      // from outcomeOf(), or "partial: " and the reason
+    std::size_t wrong = 0; // number of wrong values on the display rank
 };
 
-// Each sample as a segment of no length.
+// Adds each sample as a segment of length 0.
 inline void renderDeep(const Scene& s, const dfb::Brick& brick, dfb::DeepTile& deep)
 {
     const dfb::Region& r = deep.header().region;
@@ -111,7 +111,7 @@ inline void renderDeep(const Scene& s, const dfb::Brick& brick, dfb::DeepTile& d
                 deep.add(x, y, {sample->rgba, sample->depth, sample->depth});
 }
 
-// A frame of a group, from 1, with the loop that goes with the operation.
+// Renders frame number `frame` (from 1) of a group, with the loop that belongs to the operation.
 template <class TileOp, class FrameBuffer>
 dfb::FrameReport faultFrame(FrameBuffer& fb, const FaultGroup& group, int frame)
 {
@@ -151,7 +151,7 @@ dfb::FrameReport faultFrame(FrameBuffer& fb, const FaultGroup& group, int frame)
     }
 }
 
-// One rank's part: frames until one ends in a TransportError, after which nothing more can be done.
+// Renders frames on this rank until one ends in a TransportError, after which no further frame is possible.
 template <class Base, class TileOp = dfb::BasicAlphaBlend<16>>
 std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communicator, const FaultGroup& group,
                                      const std::vector<dfb::testing::Pixel>& expected, int frames)
@@ -169,7 +169,7 @@ std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communic
     options.checksums = true;
     std::vector<FaultEnding> endings;
     std::unique_ptr<FrameBuffer> made;
-    // Another rank may be in the first frame already, and a message of that damaged.
+    // Another rank may already be in the first frame, and a message of that frame may be damaged.
     const std::string making = outcomeOf([&] {
         made = std::make_unique<FrameBuffer>(typename Transport::Communicator{communicator, group.faults}, config,
                                              options);
@@ -200,7 +200,7 @@ std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communic
     return endings;
 }
 
-// What is wrong with the endings of one frame, over all ranks; empty if nothing is.
+// Describes what is wrong with the outcome of one frame on all ranks. Empty if nothing is.
 inline std::string verdictOn(const std::vector<FaultEnding>& ranks, bool harmless)
 {
     bool anyTransport = false;

@@ -1,5 +1,5 @@
 // Floods: frames in which every rank sends several inputs for every tile, to framebuffers with the smallest message
-// pool. For the tests with ranks in one process and those with MPI.
+// pool. Used with ranks in one process and over MPI.
 #pragma once
 
 #include "random_scene.hpp"
@@ -13,7 +13,8 @@
 
 namespace flood {
 
-// Colours are added up as inputs come, and none is kept: small whole numbers, so that any order gives the same.
+// Adds up colours as inputs arrive and keeps no input. Colours are small whole numbers, so any order gives the same
+// sum.
 class Adder {
 public:
     static constexpr int tileSize = 32;
@@ -48,7 +49,7 @@ private:
     std::vector<double> sum_;
 };
 static_assert(dfb::is_tile_op_v<Adder>);
-// What input `part` of rank `rank` has at a pixel.
+// The value of a channel at a pixel, in input `part` of rank `rank`.
 inline int valueOf(int rank, int part, int x, int y, int channel)
 {
     return 1 + (rank * 7 + part * 11 + x * 3 + y * 5 + channel) % 64;
@@ -80,7 +81,7 @@ inline std::size_t wrongSums(const dfb::Image& image, int ranks, int parts)
             }
     return wrong;
 }
-// Rows of image tiles; the smallest pool that can be.
+// A square image with `pixels` rows, in RGBA32F, and the smallest possible message pool.
 inline dfb::FrameBufferConfig floodConfig(int pixels, std::shared_ptr<dfb::Executor> executor)
 {
     dfb::FrameBufferConfig config;
@@ -92,7 +93,8 @@ inline dfb::FrameBufferConfig floodConfig(int pixels, std::shared_ptr<dfb::Execu
 }
 enum class From { Loop, Thread };
 
-// One frame in which every rank sends `parts` inputs for every tile. `sent(tile, body)` is called in place of `body`.
+// Renders one frame in which every rank sends `parts` inputs for every tile. Calls `around(tile, send)` for each input,
+// which must call `send`.
 template <class Fb, class Around>
 dfb::FrameReport floodFrame(Fb& fb, int parts, From from, const Around& around, int timeoutMs = 0)
 {

@@ -1,5 +1,5 @@
-// Forward: a transport that passes everything on to another one; a test's transport has it as its base, and members of
-// its own for what it changes.
+// Forward: a transport that passes every call on to another transport. Transports of tests derive from it and redefine
+// only the members that they change.
 #pragma once
 
 #include <dfb/comm/transport.hpp>

@@ -1,4 +1,4 @@
-// An image of which more than 2 GiB come from one rank.
+// An image of which one rank sends more than 2 GiB.
 #pragma once
 
 #include "random_scene.hpp"
@@ -8,13 +8,13 @@
 #include <memory>
 #include <string>
 
-// Rank 1 has all tiles of an image of 12288 x 12288 float pixels, rank 0 displays it; the rest have nothing. What is
-// wrong with it, compared value for value, or "". Takes 2.5 GiB.
+// Rank 1 owns all tiles of an image of 12288 x 12288 float pixels, and rank 0 displays it; other ranks have nothing.
+// Compares the image value by value and returns what is wrong with it, or "". Takes 2.5 GiB.
 template <class Transport>
 std::string largeImage(const typename Transport::Communicator& communicator, bool sharedMemory)
 {
     constexpr int side = 12288;
-    const auto value = [](int x, int y, int c) { // of an opaque pixel: it comes out as it went in
+    const auto value = [](int x, int y, int c) { // of an opaque pixel, which reaches the image unchanged
         const auto h = static_cast<std::uint32_t>(y * side + x) * 0x9e3779b1u;
         return static_cast<float>((h >> (8 * c)) & 0xff) / 256.0f;
     };
@@ -29,7 +29,7 @@ std::string largeImage(const typename Transport::Communicator& communicator, boo
                                                                                             options);
     dfb::ImageParallelLoop loop(fb);
     dfb::FrameReport report;
-    for (int frame = 0; frame < 2; ++frame) // where an image is shared, from the second one on at the latest
+    for (int frame = 0; frame < 2; ++frame) // a shared image is in use from the second frame on at the latest
         report = loop.render([&](auto& tile) {
             tile.forEachPixel([&](int x, int y, float* rgba, float&) {
                 for (int c = 0; c < 3; ++c)

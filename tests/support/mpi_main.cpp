@@ -1,5 +1,5 @@
-// Runs the tests on every rank. A passing rank other than 0 says nothing; a failing one always does, with its number
-// before each line; the exit code is the largest over the ranks.
+// Runs the tests on every rank. Rank 0 prints everything; the others leave out the lines that passing runs print. Each
+// line begins with the number of its rank. The exit code is the largest of all ranks.
 #include "run_tests.hpp"
 
 #include <mpi.h>
@@ -14,7 +14,8 @@
 
 namespace {
 
-// Passes lines on as they come, so that nothing is lost in a crash or a hang, but for those that a passing run prints.
+// Passes each line on at once, so that none is lost in a crash or a hang. Ranks other than 0 drop what passing runs
+// print.
 class RankOutput : public std::streambuf {
 public:
     explicit RankOutput(int rank) : rank_(rank) {}
@@ -47,7 +48,7 @@ private:
     std::string line_;
 };
 
-// Naps while it waits: some MPI libraries would spin, and there may be more ranks than cores.
+// Sleeps while it waits, as some MPI libraries would spin, and there may be more ranks than cores.
 int largest(int value)
 {
     int result = value, done = 0;

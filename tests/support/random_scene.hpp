@@ -1,6 +1,5 @@
 // Scene: bricks whose pixels are a pure function of (seed, brick, pass, pixel), the loops that render them on any
-// number of ranks, and the reference image of the same scene. For the tests with ranks in one process and those with
-// MPI.
+// number of ranks, and the reference image of the same scene. Used with ranks in one process and over MPI.
 #pragma once
 
 #include <dfb/dfb.hpp>
@@ -36,7 +35,7 @@ struct Scene {
     int passes = 1;
     std::chrono::milliseconds timeout{0};
     bool allowPartial = false;
-    dfb::BlendRule rule = dfb::BlendRule::SortByDepth; // InOrder: of the bricks
+    dfb::BlendRule rule = dfb::BlendRule::SortByDepth; // InOrder: in the order of `bricks`
     std::array<float, 4> background{0.125f, 0.25f, 0.0f, 0.5f};
     std::uint64_t seed = 1;
     std::vector<dfb::Brick> bricks;
@@ -51,8 +50,8 @@ inline std::uint64_t mix(std::uint64_t h)
     return h ^ (h >> 31);
 }
 
-// `count` bricks, some of which overlap on the image, the first over all of it, the rest in part of it: some tiles stay
-// background where count > 1 and the first is left out.
+// Makes bricks at pseudo-random places, each over a part of the image. Some overlap, and some tiles may stay
+// background.
 inline Scene makeScene(int brickCount, std::uint64_t seed = 1, int width = 97, int height = 61, int passes = 1)
 {
     Scene s;
@@ -71,7 +70,7 @@ inline Scene makeScene(int brickCount, std::uint64_t seed = 1, int width = 97, i
     return s;
 }
 
-// What a brick has at a pixel; nothing where it is not, or has a hole.
+// The sample of a brick at a pixel, or nothing if the pixel is outside the brick or in a hole of it.
 inline std::optional<dfb::testing::Sample> sampleOf(const Scene& s, const dfb::Brick& brick, int pass, int x, int y)
 {
     if (!FlatCamera().project(brick.bounds, s.width, s.height).contains(x, y))
@@ -139,10 +138,10 @@ inline std::vector<dfb::Brick> bricksOf(const Scene& s, int rank, int rankCount,
 }
 
 enum class Loop {
-    Listing3,   // by hand, as in the paper: the owner sends a background tile that announces the bricks
+    Listing3,   // a loop by hand, as in the paper: the owner sends a background tile that announces the bricks
     Declared,   // DataParallelLoop
-    ImageOwned, // ImageParallelLoop of owned tiles; the scene has one brick
-    ImageDealt  // the same of tiles dealt out otherwise
+    ImageOwned, // ImageParallelLoop, each rank renders the tiles that it owns; the scene has one brick
+    ImageDealt  // the same image; which rank renders a tile does not depend on its owner
 };
 
 inline bool isDataParallel(Loop loop) { return loop == Loop::Listing3 || loop == Loop::Declared; }
@@ -214,7 +213,7 @@ dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal
             FlatCamera(), [&](const dfb::Brick& brick, auto& tile) { renderBrick(s, brick, tile); }, paramsOf(s));
 }
 
-// What the display rank had after a frame.
+// The image of the display rank after a frame, and the report of this rank.
 struct Picture {
     int width = 0, height = 0;
     dfb::OutputFormat format = dfb::OutputFormat::None;
@@ -245,7 +244,7 @@ struct Picture {
     }
 };
 
-// `more(sample, pass, x, y)` gives a sample what it has beside colour and depth.
+// Calls `more(sample, pass, x, y)` to add to a sample what it has beside colour and depth.
 template <class More>
 std::vector<dfb::testing::Pixel> referenceOf(const Scene& s, const More& more)
 {
@@ -255,7 +254,7 @@ std::vector<dfb::testing::Pixel> referenceOf(const Scene& s, const More& more)
             std::vector<dfb::testing::Pixel> passes;
             for (int pass = 0; pass < s.passes; ++pass) {
                 std::vector<dfb::testing::Sample> samples;
-                for (const dfb::Brick& brick : s.bricks) // what is all 0 is nothing, unless it has a depth
+                for (const dfb::Brick& brick : s.bricks) // a sample of 0 counts only for Nearest
                     if (auto sample = sampleOf(s, brick, pass, x, y);
                         sample && (s.rule == dfb::BlendRule::Nearest || sample->rgba != std::array<float, 4>{})) {
                         more(*sample, pass, x, y);
@@ -276,7 +275,7 @@ inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
     return referenceOf(s, [](const dfb::testing::Sample&, int, int, int) {});
 }
 
-// The same where some tiles are not complete.
+// The reference in which the tiles that are not complete in `fb` are background.
 template <class FrameBuffer>
 std::vector<dfb::testing::Pixel> referenceOf(const Scene& s, const FrameBuffer& fb,
                                              std::vector<dfb::testing::Pixel> expected)
@@ -291,7 +290,7 @@ std::vector<dfb::testing::Pixel> referenceOf(const Scene& s, const FrameBuffer& 
     return expected;
 }
 
-// Number of values that are off: floats by more than 1 ulp, bytes and depths at all. All of them if the size is wrong.
+// Number of wrong values. Floats may be off by 1 ulp, bytes and depths not at all. If the size is wrong, all are wrong.
 inline std::size_t wrongValues(const Picture& picture, const std::vector<dfb::testing::Pixel>& expected)
 {
     const std::size_t count = expected.size();
@@ -315,7 +314,7 @@ inline std::size_t wrongValues(const Picture& picture, const std::vector<dfb::te
     return wrong;
 }
 
-// What came out of a call, as text.
+// The outcome of a call as text: "fine", or the type and message of its exception.
 template <class Call>
 std::string outcomeOf(const Call& call)
 {
@@ -335,7 +334,7 @@ std::string outcomeOf(const Call& call)
 
 inline bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
-// With one worker, tasks run in the order of arrival. With none, the threads of the ranks run them.
+// With one worker, tasks run in the order of arrival. Without workers, the threads of the ranks run them.
 inline dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
 {
     dfb::FrameBufferConfig config;

@@ -1,4 +1,4 @@
-// Ranks and what they have in common. All but the first two are collective over MPI_COMM_WORLD.
+// Helpers for ranks of MPI. All but rankIn() and sizeOf() are collective.
 #pragma once
 
 #include "undisturbed.hpp"
@@ -26,7 +26,7 @@ inline int sizeOf(MPI_Comm communicator)
     return size;
 }
 
-// Whether all ranks have the same text, or the same 4000 characters of it.
+// Whether this rank has the same text as rank 0, of which 3999 characters count. Collective over MPI_COMM_WORLD.
 inline bool sameEverywhere(const std::string& text)
 {
     std::vector<char> first(4000);
@@ -35,7 +35,8 @@ inline bool sameEverywhere(const std::string& text)
     return text.compare(0, first.size() - 1, first.data()) == 0;
 }
 
-// Runs a case until no rank's process stood still: see undisturbed().
+// Calls run() up to four times, as long as any rank's process stood still meanwhile; see undisturbed(). Collective over
+// MPI_COMM_WORLD.
 template <class Run>
 auto undisturbedRanks(const Run& run)
 {
@@ -45,7 +46,7 @@ auto undisturbedRanks(const Run& run)
     });
 }
 
-// Whether each rank sees memory of the next one; a system may not allow it.
+// Whether each rank can open memory of the next one. A system may forbid it. Collective over `communicator`.
 inline bool seesNextRank(MPI_Comm communicator)
 {
     using Memory = dfb::detail::NodeMemory;

@@ -1,4 +1,4 @@
 #pragma once
 
-// Runs this program's tests as its arguments say; returns Catch's exit code.
+// Runs the tests that the arguments select and returns Catch's exit code.
 int runTests(int argc, char** argv);

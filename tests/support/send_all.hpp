@@ -1,4 +1,4 @@
-// sendAll: a scene by hand.
+// sendAll: sends the inputs of a scene with setTile(), without a rendering loop.
 #pragma once
 
 #include "random_scene.hpp"
@@ -7,7 +7,7 @@
 
 namespace frame_cases {
 
-// Sends what this rank has of a scene into an open frame, as in Listing 3 of the paper.
+// Sends this rank's inputs of every second tile into an open frame, as in Listing 3 of the paper.
 template <class FrameBuffer, class Frame>
 void sendAll(FrameBuffer& fb, Frame& frame, const scene::Scene& s, bool second)
 {
@@ -16,7 +16,7 @@ void sendAll(FrameBuffer& fb, Frame& frame, const scene::Scene& s, bool second)
     const auto meets = [&](const dfb::Brick& b, int index) {
         return !dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), fb.layout().region(index)).empty();
     };
-    for (int index = second ? 1 : 0; index < fb.layout().tileCount(); index += 2) { // one half, then the other
+    for (int index = second ? 1 : 0; index < fb.layout().tileCount(); index += 2) { // even or odd tiles
         if (fb.tileOwner(index) == fb.rank()) {
             frame.start(*tile, index);
             for (const dfb::Brick& b : s.bricks)

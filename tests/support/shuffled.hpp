@@ -1,4 +1,4 @@
-// ShuffledTransport: ranks are threads, and with a seed messages arrive in a pseudo-random order.
+// ShuffledTransport: ranks are threads. With a seed, messages arrive in a pseudo-random order.
 #pragma once
 
 #include "forward.hpp"
@@ -38,7 +38,7 @@ public:
         inner_.start(*this);
     }
 
-    // Waits until some have gathered or no more come, then delivers any one.
+    // Waits until 16 messages have arrived or no more come, then delivers one of them at random.
     bool poll()
     {
         Arrival next;
@@ -47,7 +47,7 @@ public:
             if (waiting_.empty())
                 return false;
             if (waiting_.size() < 16 && patience_++ < 3) {
-                interrupt(); // to be asked again soon
+                interrupt(); // so that poll() is called again soon
                 return false;
             }
             std::swap(waiting_[static_cast<std::size_t>(random_() % waiting_.size())], waiting_.back());
@@ -85,6 +85,6 @@ private:
     std::mt19937_64 random_;
     dfb::TransportHandler* handler_ = nullptr;
     std::mutex mutex_;
-    std::vector<Arrival> waiting_; // under mutex_, as is the next
+    std::vector<Arrival> waiting_; // under mutex_, as is patience_
     int patience_ = 0;             // polls without an arrival
 };

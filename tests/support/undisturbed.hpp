@@ -1,5 +1,5 @@
-// Undisturbed: runs a case again if this process stood still meanwhile, as on a machine that is busy with other things.
-// Time-outs pass then that nothing in the case has caused.
+// undisturbed: runs a case again if this process stood still meanwhile, as on a machine that is busy with other work.
+// Then time-outs may pass that nothing in the case has caused.
 #pragma once
 
 #include <algorithm>
@@ -8,7 +8,7 @@
 #include <future>
 #include <thread>
 
-// Notices how long this process stood still, at most: by that much a nap of a thread of its own was late.
+// Measures for how long this process stood still at most: a thread sleeps again and again, and may wake up late.
 class StandStill {
 public:
     using Clock = std::chrono::steady_clock;
@@ -18,7 +18,7 @@ public:
     StandStill& operator=(const StandStill&) = delete;
     ~StandStill() { end(); }
 
-    // Ends the watch, and says how long.
+    // Ends the measurement and returns the longest standstill.
     Clock::duration end()
     {
         over_ = true;
@@ -51,14 +51,15 @@ struct IfItStoodStill {
     }
 };
 
-// Returns or throws what run() does. Runs it up to four times, as long as `again(stoodStill, result)`: whether this
-// process stood still for a quarter of a second, and the std::shared_future of what came of it.
+// Returns or throws what run() does. Calls run() up to four times, as long as `again(stoodStill, result)` returns true.
+// `stoodStill` says whether this process stood still for 250 ms; `result` is a std::shared_future of what run() returns
+// or throws.
 template <class Run, class Again = IfItStoodStill>
 auto undisturbed(const Run& run, const Again& again = Again())
 {
     for (int left = 4;; --left) {
         StandStill standStill;
-        const auto result = std::async(std::launch::deferred, run).share(); // which keeps what it throws
+        const auto result = std::async(std::launch::deferred, run).share(); // the future keeps an exception
         result.wait();
         if (!again(standStill.end() >= std::chrono::milliseconds(250), result) || left == 1)
             return result.get();
