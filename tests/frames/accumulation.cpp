@@ -1,4 +1,5 @@
-// Samples that accumulate over frames without a plan: "so many more until the camera moves".
+// Samples that accumulate over frames without a plan: "so many more until the camera moves". In one process and over
+// MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 
@@ -28,8 +29,7 @@ inline bool isImageParallel(Loop loop)
     return loop == Loop::ImageOwned || loop == Loop::ImageRoundRobin || loop == Loop::ImageDynamic;
 }
 
-// A frame of a scene, whose pixels are a function of tile.sample. With `fails`, rendering throws on the last rank that
-// has anything to render.
+// Renders one frame. The pixels depend on tile.sample. With `fails`, every rank that renders something throws.
 template <class FrameBuffer>
 dfb::FrameReport render(FrameBuffer& fb, Loop loop, const scene::Scene& s, const dfb::World& world,
                         const dfb::SharedWorld& shared, dfb::FrameConfig params, bool fails = false)
@@ -39,7 +39,7 @@ dfb::FrameReport render(FrameBuffer& fb, Loop loop, const scene::Scene& s, const
         if (fails)
             throw std::runtime_error("on purpose");
         const int pass = tile.pass;
-        tile.pass = tile.sample; // the scene knows no frames
+        tile.pass = tile.sample; // the scene knows only passes
         scene::renderBrick(s, b, tile);
         tile.pass = pass;
     };
@@ -111,7 +111,7 @@ dfb::FrameReport render(FrameBuffer& fb, Loop loop, const scene::Scene& s, const
     return dfb::DataParallelLoop(fb, world).render(scene::FlatCamera(), renderBrick, params);
 }
 
-// Of a scene of that many bricks, rule and seed; made once.
+// The reference of a scene, computed once for each number of bricks, blend rule, seed and number of samples.
 inline const std::vector<dfb::testing::Pixel>& referenceOf(scene::Scene s, int samples)
 {
     static std::mutex mutex;
@@ -127,7 +127,7 @@ inline const std::vector<dfb::testing::Pixel>& referenceOf(scene::Scene s, int s
 
 } // namespace accumulation
 
-// Each frame renders the next samples, and the image is the mean of all since the id has changed or a frame has failed.
+// Each frame renders the next samples. The image is the mean of all samples since the id changed or a frame failed.
 struct NextSamples {
     using Loop = accumulation::Loop;
 
@@ -145,7 +145,8 @@ struct NextSamples {
             const dfb::SharedWorld shared(fb, world);
             dfb::FrameConfig params = paramsOf(s);
             params.timeout = std::chrono::milliseconds(20000); // nothing waits for it
-            // Renders the next samples, after which there must be `all`, or none if the frame fails.
+            // Renders the next `passes` samples. The image must then have `all` samples; if `all` is 0, the frame
+            // fails.
             const auto frame = [&](int passes, int all) {
                 params.passes = passes;
                 dfb::FrameReport report;
@@ -176,7 +177,7 @@ struct NextSamples {
             frame(2, 0);
             frame(1, 1); // after a failure it begins again
             frame(2, 3);
-            // A plan says what comes next by itself; after it, it begins again.
+            // A plan itself says which samples come next. After a frame with a plan, accumulation begins again.
             auto plan = std::make_shared<std::vector<dfb::TileSamples>>(
                 static_cast<std::size_t>(fb.layout().tileCount()), dfb::TileSamples{3, 2});
             params.samples = plan;
@@ -207,8 +208,8 @@ struct NextSamples {
     }
 };
 
-// Bricks move, come and go, and the id stays: the image is the mean of all samples, of each frame those that it had,
-// also in tiles that nothing was in at first or is in no more.
+// Bricks move, come and go, and the id stays. The image is the mean of the samples of all frames, each with the bricks
+// of its frame, also in tiles that were empty at first or are empty now.
 struct MovingSamples {
     template <class Op, class Transport>
     static void accumulate(const typename Transport::Communicator& communicator,

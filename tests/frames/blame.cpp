@@ -1,4 +1,5 @@
-// What errors name: the rank, the setting and its values, the input; on every rank alike, and the next frame is right.
+// Errors name the rank, the setting and its values, or the input. Every rank gets the same error, and the next frame is
+// right. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 
@@ -39,10 +40,11 @@ void expectGoodFrame(Result& result, Fb& fb, const scene::Scene& s, const std::s
     result.expect(text == "fine", "after " + what + ": " + text);
 }
 
-// The first and the last rank in turn are the odd one.
+// The ranks that in turn behave differently from the others: the first and the last one.
 inline std::vector<int> oddRanks(int size) { return size > 1 ? std::vector<int>{0, size - 1} : std::vector<int>{}; }
 
-// What a text has where `odd` has `its`, and the others `usual`: any of them may be named.
+// The part of an error text that names two values, if `odd` has `its` and the other ranks have `usual`. Which of the
+// others is named is open.
 inline std::string valuesText(int odd, const std::string& usual, const std::string& its)
 {
     return odd == 0 ? its + " on rank 0 and " + usual + " on rank " : " and " + its + " on rank " + std::to_string(odd);
@@ -184,7 +186,7 @@ struct BlamedConfig {
                                           std::make_shared<dfb::ThreadExecutor>(1));
                 });
             };
-            // The exception takes the connection along.
+            // The exception destroys the framebuffer and, with it, the connection.
             const auto makeWide = [&](int width) {
                 return scene::outcomeOf([&] {
                     const auto connection = dfb::connect<Transport>(communicator);
@@ -263,7 +265,7 @@ struct BlamedCalls {
     }
 };
 
-// Own trees and bricks.
+// Errors in trees that a program builds itself, and in the ids of bricks.
 struct BlamedTree {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -275,9 +277,9 @@ struct BlamedTree {
         const int size = fb.size(), owner = fb.tileOwner(5);
         const auto tile = std::make_unique<typename Fb::Tile>();
         {
-            // The owner announces what never comes.
+            // The owner announces inputs that never come.
             dfb::FrameConfig params;
-            // A rank may begin so much later than the others: they give it up after twice the time.
+            // So much later than the others may a rank begin the frame: they give it up after twice this time.
             params.timeout = std::chrono::milliseconds(1000);
             std::string text;
             dfb::ErrorInfo error;
@@ -409,8 +411,8 @@ struct BlamedLoop {
     }
 };
 
-// An error of all ranks that ends the framebuffer, too: one rank has it first, and its leaving must not hide it from
-// others.
+// An error of all ranks that also destroys their framebuffers. One rank gets it first; that this rank then leaves must
+// not hide the error from the others.
 struct BlamedOutside {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)

@@ -1,4 +1,5 @@
-// Operations on layers: auxiliary channels, blending in a given order, the nearest.
+// Operations on layers: auxiliary channels, blending in a given order, the nearest input. In one process and over MPI
+// (everywhere.hpp).
 
 #include "aux.hpp"
 #include "everywhere.hpp"
@@ -45,7 +46,7 @@ struct AuxChannels {
     }
 };
 
-// One that all ranks have, and that a pixel operation sees.
+// One brick that all ranks have, whose auxiliary channels a pixel operation sees.
 struct AuxImageParallel {
     struct SeeAux {
         std::atomic<std::int64_t>* pixels = nullptr;
@@ -119,10 +120,11 @@ struct Nearest {
     }
 };
 
-// ---- what has a depth is there, whatever its colour -------------------------------------------------------------
+// ---- a pixel with a depth counts, whatever its colour -----------------------------------------------------------
 
-// A surface of black pixels, some of alpha 0, with the ids 0 and none, before a white one. It covers all of some tiles,
-// all alike or not, and spans or single pixels of others; where it is not, it has the colour of a cleared image.
+// A surface of black pixels, some with alpha 0, in front of a white one. Its primitive id is 0, and it has no instance
+// id. In some tiles it covers all pixels, with equal or different values, in others spans or single pixels. Where it is
+// absent, pixels have a renderer's clear colour and infinite depth.
 struct BlackInFront {
     static constexpr int width = 90, height = 40;
     static constexpr std::uint32_t front = 20, back = 30;
@@ -157,7 +159,7 @@ struct BlackInFront {
         return p;
     }
 
-    // Of a brick, each as large as the image.
+    // The channels of one brick, each as large as the image.
     struct Planes {
         std::vector<float> color, depth, normal, albedo, position;
         std::vector<std::uint32_t> primitive, instance;

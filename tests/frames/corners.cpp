@@ -1,6 +1,7 @@
-// Corners: a frame that fails in every way, by every rank, at every point of it, with each loop and operation. All
-// ranks get the same error, which says who and where, or the image without the tile that it was about; and the next
-// frame on the same framebuffer is right.
+// Corners: each rank in turn makes a frame fail, in every way and at every point of the frame, with each loop and
+// operation. All ranks must get the same error, which says who failed and where, or the image without the tiles that
+// the error is about. The next frame on the same framebuffer must be right. In one process and over MPI
+// (everywhere.hpp).
 
 #include "everywhere.hpp"
 
@@ -24,9 +25,9 @@ namespace frame_cases {
 
 namespace corners {
 
-// What goes wrong on the culprit.
+// What goes wrong on one rank, the culprit.
 enum Kind {
-    // An exception of user code: its call of that number throws.
+    // An exception of user code: one call, given by its number, throws.
     Render,
     Copy, // of the tile operation's frame data
     NewFrame,
@@ -35,7 +36,7 @@ enum Kind {
     PixelNewFrame,
     Process,
     Sites,
-    // What it does with its frame.
+    // Something that the culprit does with its frame.
     Abort = Sites,
     Cancel,
     Leave,           // without end()
@@ -48,13 +49,13 @@ enum Kind {
 };
 inline bool isExtraInput(int kind) { return kind == Duplicate || kind == WrongGeneration || kind == OneTooMany; }
 
-// Where in all that the culprit does. AtEnd: all is sent, and then it goes wrong.
+// The point at which the culprit fails. AtEnd: after it has sent all of its inputs.
 enum Phase { First, Middle, Last, AtEnd, Phases };
 
-// The user code of one rank: counts its calls, and throws in one of them if it is told so.
+// The user code of one rank: counts its calls, and throws in one of them if it is told to.
 class Trap {
 public:
-    // Throws at that call of that kind, counted from 0; -1: at none.
+    // Makes call number `call` (from 0) of this kind throw, or none if it is -1.
     void set(int kind, int call)
     {
         for (auto& count : calls_)
@@ -169,7 +170,7 @@ inline bool isImageParallel(Loop loop)
     return loop == Loop::ImageOwned || loop == Loop::ImageRoundRobin || loop == Loop::ImageDynamic;
 }
 
-// What a brick has at a pixel beside its sample, for the loop with deep fragments.
+// The second sample of a brick at a pixel, if it has one. Only the loop with deep fragments renders it.
 inline std::optional<dfb::testing::Sample> secondOf(const dfb::testing::Sample& first, int x, int y)
 {
     if ((x + y) % 2 == 0)
@@ -226,7 +227,7 @@ inline std::string nameOf(const Fault& fault)
            + (fault.partial ? ", partial" : "");
 }
 
-// What a rank got out of a frame.
+// The outcome of a frame on one rank.
 struct Ending {
     std::string text;
     std::optional<dfb::ErrorInfo> error;
@@ -234,7 +235,7 @@ struct Ending {
     bool isOver = true; // else it was left
 };
 
-// All faults that there are for one loop and operation, on one framebuffer.
+// Tests all faults that are possible with one loop and operation, on one framebuffer.
 template <class TileOp, class PixelOp, class Transport>
 class Corner {
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, Transport>;
@@ -249,7 +250,7 @@ public:
     {
     }
 
-    // How many faults there were.
+    // Returns the number of faults tested. Collective.
     int run()
     {
         std::uint64_t hash = 0;
@@ -296,7 +297,8 @@ private:
     void expect(bool condition, const std::string& what) { result_.expect(condition, prefix() + what); }
     std::string prefix() const { return "loop " + std::to_string(static_cast<int>(loop_)) + ", " + name_ + ": "; }
 
-    // A good frame of each scene, both compared with the reference; what the ranks do in one.
+    // Renders each scene without a fault and compares it with the reference. Records how often each rank calls user
+    // code.
     void dryRun(std::uint64_t& hash)
     {
         name_ = "nothing";
@@ -325,7 +327,7 @@ private:
         }
     }
 
-    // What the display rank has.
+    // Returns the display rank's value on all ranks.
     std::uint64_t shared(std::uint64_t value)
     {
         std::vector<std::byte> bytes(sizeof value);
@@ -335,7 +337,7 @@ private:
         return value;
     }
 
-    // The same on all ranks.
+    // The faults to test, the same on all ranks.
     std::vector<Fault> allFaults() const
     {
         std::vector<int> culprits(static_cast<std::size_t>(fb_.size()));
@@ -354,7 +356,7 @@ private:
         return faults;
     }
 
-    // Whether a fault can be, and what there is to be lost is not lost by a time-out. Sets fault.call.
+    // Whether the fault is possible and its outcome does not depend on a time-out. Sets fault.call.
     bool isThere(Fault& fault) const
     {
         const auto& done = done_[static_cast<std::size_t>(fault.culprit)];
@@ -365,12 +367,14 @@ private:
             const bool isNew = fault.phase == First ? count > 0 : fault.phase == Middle ? count > 2 : count > 1;
             if (fault.phase == AtEnd || !isNew)
                 return false;
-            // Who gets a job that is handed out on demand is not known; without an input there is a time-out.
+            // Which rank gets a job that is handed out on demand is not known. A partial frame without an input waits
+            // for its time-out.
             return fault.kind != Render || (loop_ != Loop::ImageDynamic && !fault.partial);
         }
         if (isExtraInput(fault.kind)) {
-            // That the owner sees it before it votes is sure of its own tile only; else the culprit waits for word of
-            // the failure, which there is none of in a frame that goes on.
+            // The owner must see the input before it votes. That is certain only if the culprit itself owns the tile.
+            // Otherwise the culprit waits until it hears of the failure, which it never does in a partial frame, as
+            // that goes on.
             return loop_ != Loop::ImageDynamic && done[fault.partial ? Sites + 1 : Sites] != 0
                    && (byHand || fault.phase == AtEnd);
         }
@@ -406,7 +410,7 @@ private:
                 return ending;
             }
             if (mine && isExtraInput(fault.kind) && !fault.partial) {
-                // As long as this rank has not voted the failure is in time.
+                // As long as this rank has not voted, the failure still counts for this frame.
                 const auto limit = std::chrono::steady_clock::now() + std::chrono::milliseconds(timeoutMs / 4);
                 while (!frame.failed() && std::chrono::steady_clock::now() < limit)
                     if (!fb_.poll()) // where there are no workers, nobody else does
@@ -433,7 +437,7 @@ private:
             return fb_.begin(params, TrapData(&trap_), {&trap_});
     }
 
-    // Renders all that this rank has; the fault is its own.
+    // Renders all inputs of this rank, with `fault` if this rank is the culprit.
     Frame start(const scene::Scene& s, const dfb::FrameConfig& params, const Fault& fault)
     {
         const TrapData data(&trap_);
@@ -494,7 +498,7 @@ private:
         }
     }
 
-    // Listing 3 of the paper.
+    // A loop as in Listing 3 of the paper.
     Frame byHand(const scene::Scene& s, const dfb::FrameConfig& params, const Fault& fault)
     {
         struct Input {
@@ -540,8 +544,8 @@ private:
         return frame;
     }
 
-    // An input that this rank sends, and one that it sends to itself: the first, and the same in every frame but
-    // for their number.
+    // Notes the first input that this rank sends, and the first that it sends to itself. Both are the same in every
+    // frame but for the frame number.
     void note(const dfb::TileHeader& header)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -578,7 +582,7 @@ private:
         return fault.partial ? *sentToSelf_ : *sent_;
     }
 
-    // ---- what came of it
+    // ---- the outcome of a frame
 
     void check(const Fault& fault, const Ending& ending)
     {
@@ -588,7 +592,8 @@ private:
             return;
         }
         const dfb::ErrorInfo& error = *ending.error;
-        // One too many takes the place of another, which may come too late to be told from it.
+        // A surplus input takes the place of an announced one. That one may come too late to be told from a surplus
+        // input.
         const bool isStray = fault.kind == OneTooMany && loop_ == Loop::ByHand && fault.partial
                              && error.kind == ErrorKind::Disagreement && error.got == 1;
         if (isStray) {
@@ -629,7 +634,7 @@ private:
             checkTiles(fault, ending);
     }
 
-    // On the display rank: what is complete is right, the rest background.
+    // On the display rank: complete tiles are right, and the others show the background.
     void checkTiles(const Fault& fault, const Ending& ending)
     {
         const scene::Picture picture(fb_.image(), ending.report);
@@ -665,7 +670,7 @@ private:
             expect(incomplete.empty(), "tiles are missing: " + std::to_string(incomplete.size()));
     }
 
-    // All ranks have the same text for a fault.
+    // Checks that all ranks have the same text for each fault.
     void compare(const std::vector<std::string>& texts, const std::vector<Fault>& faults)
     {
         std::string mine;

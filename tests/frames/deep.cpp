@@ -1,4 +1,4 @@
-// Deep fragments: bricks that are interleaved along the rays.
+// Deep fragments: bricks that interleave along the rays. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 
@@ -9,7 +9,7 @@
 
 namespace frame_cases {
 
-// Along each ray there are 12 slots, each filled by one of three bricks or by nobody.
+// Along each ray there are 12 slots. Each is filled by one of three bricks or is empty.
 struct Interleaved {
     static constexpr int slots = 12, bricks = 3;
     int width = 61, height = 47;
@@ -125,7 +125,7 @@ struct Deep {
             return largest;
         };
 
-        // All segments: exact.
+        // With all segments the image is exact.
         dfb::DeepParallelLoop exact(fb, world, Interleaved::slots);
         for (const bool backToFront : {false, true}) {
             params.passes = 2;
@@ -143,7 +143,7 @@ struct Deep {
             }
         }
 
-        // Fewer: within the bound, which falls as there are more.
+        // With fewer segments the error stays within the bound, which falls as there are more segments.
         double boundBefore = 10;
         params.passes = 1;
         for (const int segments : {1, 2, 3, 5}) {

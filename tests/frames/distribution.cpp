@@ -1,4 +1,4 @@
-// Bricks that several ranks hold, and bricks in a known order.
+// Bricks that several ranks hold, and bricks in a known order. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 
@@ -19,7 +19,7 @@ using Blend = dfb::BasicAlphaBlend<16>;
 template <class Transport>
 using BlendFrameBuffer = dfb::DistributedFrameBuffer<Blend, dfb::NoPixelOp, Transport>;
 
-// Brick i is held by the ranks i, i + 1, ... of `copies`, counted round.
+// Brick i is held by `copies` ranks: i, i + 1, ..., modulo the number of ranks.
 inline dfb::World replicated(const std::vector<dfb::Brick>& bricks, int rank, int size, int copies)
 {
     dfb::World world;
@@ -30,7 +30,7 @@ inline dfb::World replicated(const std::vector<dfb::Brick>& bricks, int rank, in
     return world;
 }
 
-// ---- who renders what does not show ----------------------------------------------------------------------------
+// ---- the image does not show who rendered what ------------------------------------------------------------------
 
 struct Mixed {
     template <class Transport>
@@ -95,7 +95,7 @@ struct Mixed {
     }
 };
 
-// Two ranks with the same id and other bounds are told so, all of them.
+// If two ranks have a brick with the same id and different bounds, all ranks get an error that says so.
 struct OtherBounds {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -108,15 +108,15 @@ struct OtherBounds {
             const dfb::SharedWorld world(fb, dfb::World({{7, {{0, 0, 0}, {wide, 1, 1}}}}));
         });
         result.expect(fb.size() == 1 ? outcome == "fine" : scene::has(outcome, "brick 7 has other bounds"), outcome);
-        // The same bounds and another id: two bricks.
+        // Two ids with the same bounds are two bricks.
         const dfb::SharedWorld world(fb, dfb::World({{1, {{0, 0, 0}, {1, 1, 1}}}, {2, {{0, 0, 0}, {1, 1, 1}}}}));
         result.expect(world.bricks().size() == 2, "two bricks with equal bounds");
         return result;
     }
 };
 
-// All data in one corner of the view, most of it in one brick: two ranks for each brick take much of the slowest rank's
-// work, and more if the costs decide.
+// All data are in one corner of the view, most of them in one brick. If two ranks hold each brick, the slowest rank has
+// much less work, and less still if measured costs decide who renders.
 struct Unbalanced {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -124,7 +124,7 @@ struct Unbalanced {
         Result result;
         scene::Scene s = scene::makeScene(0, 1, 256, 256, 1);
         const int size = std::max(2, communicatorSize<Transport>(communicator));
-        for (int i = 0; i < size; ++i) { // beside each other, the first the largest
+        for (int i = 0; i < size; ++i) { // side by side, the first one is the largest
             const float x0 = i == 0 ? 0 : 64.0f + 8.0f * static_cast<float>(i - 1),
                         x1 = 64.0f + 8.0f * static_cast<float>(i);
             s.bricks.push_back({static_cast<std::uint32_t>(i), {{x0, 0, 0}, {x1, 96, 1}}});
@@ -166,7 +166,8 @@ struct Unbalanced {
         return result;
     }
 
-    // The scene has a brick per rank, so its image depends on how many there are, and no hash is compared.
+    // The scene has a brick per rank, so the image depends on the number of ranks. Hence run() returns no hash to
+    // compare.
     template <class Transport>
     static int communicatorSize(const typename Transport::Communicator& communicator)
     {
@@ -179,7 +180,7 @@ struct Unbalanced {
 
 // ---- in a known order ------------------------------------------------------------------------------------------
 
-// Boxes of glass with bubbles, seen by a camera that stands among them.
+// Boxes of glass with bubbles, seen by a camera among them.
 struct Ordered {
     static std::vector<dfb::Brick> boxes()
     {
@@ -210,7 +211,7 @@ struct Ordered {
         return first < last ? first : -1;
     }
 
-    // A camera of which loops do not know where its rays begin.
+    // A camera of which loops cannot tell where its rays begin.
     struct AnyCamera {
         dfb::PerspectiveCamera camera;
         auto project(const dfb::Box3& box, int width, int height) const { return camera.project(box, width, height); }
@@ -245,7 +246,7 @@ struct Ordered {
         const auto renderBrick = [&](const dfb::Brick& b, auto& tile) {
             tile.forEachPixel([&](int x, int y, float* rgba, float& depth) { shade(b, x, y, rgba, depth); });
         };
-        // The same pixels, as images of this rank's bricks that are there beforehand.
+        // The same pixels as rendered images of all bricks, for rendering in place.
         constexpr std::size_t stride = 97 + 5;
         struct BrickImage {
             std::vector<float> rgba = std::vector<float>(4 * stride * 61, 0.0f);
@@ -318,7 +319,7 @@ struct Ordered {
     }
 };
 
-// Nothing waits for its time-out.
+// No case waits for this time-out.
 scene::Scene threeBricks()
 {
     scene::Scene s = scene::makeScene(3, 6);
@@ -326,8 +327,7 @@ scene::Scene threeBricks()
     return s;
 }
 
-// An order without one of the sources, or that is not the same on all ranks, fails the frame on all of them; the next
-// is right.
+// An order that lacks a source, or that differs between ranks, fails the frame on all ranks; the next frame is right.
 struct WrongOrder {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -361,11 +361,11 @@ struct WrongOrder {
     }
 };
 
-// An owner that names a rank without the brick, and an order that is none, are errors on all ranks; the next frame is
-// right.
+// An owner that names a rank without the brick, or an order that does not have each brick once, is an error on all
+// ranks; the next frame is right.
 struct WrongOwner {
     struct Owner {
-        int size = 1, shift = 0; // from one that has it; -1: nobody
+        int size = 1, shift = 0; // shift: from the first rank that has it; -1: no rank
 
         int operator()(const dfb::SharedBrick& brick, int, int) const
         {

@@ -1,4 +1,5 @@
-// What an opaque input hides is not waited for, nor sent by those who have heard of it.
+// Inputs that an opaque input hides: owners do not wait for them, and ranks that have heard of it do not send them. In
+// one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 
@@ -28,14 +29,14 @@ struct Hidden {
         return c;
     }
 
-    // Brick `i` at a pixel; that with number 2 is opaque on the left, if any is.
+    // The colour of brick `i` at a pixel. With `isOpaque`, the left part of brick 2 is opaque.
     static std::array<float, 4> colorOf(std::uint32_t i, int x, int y, bool isOpaque)
     {
         const float alpha = isOpaque && i == 2 && x < 55 ? 1.0f : 0.25f + 0.0625f * static_cast<float>((x + y) % 4);
         return {alpha * 0.125f * static_cast<float>(i), alpha * 0.25f, alpha * static_cast<float>(x % 3) / 4, alpha};
     }
 
-    // 6 bricks over the whole image, through the loop.
+    // 6 bricks, each over the whole image, rendered by OrderedLoop.
     template <class Transport>
     static void renderAll(const typename Transport::Communicator& communicator, Result& result)
     {
@@ -69,7 +70,7 @@ struct Hidden {
             loop.render(scene::FlatCamera(), order, render);
             result.expect(std::chrono::steady_clock::now() - start < std::chrono::seconds(30), "no word");
             const std::int64_t all = fb.allReduce({rendered}, Fb<Transport>::Reduce::Sum)[0];
-            // On a single rank at most one worker is at the tile while the other renders what hides it.
+            // On a single rank, one worker at most renders a tile's brick while the other worker renders what hides it.
             const int tiles = fb.layout().tileCount();
             result.expect(all >= 3 * tiles && all <= 6 * tiles, std::to_string(all) + " tiles rendered");
             result.expect(isOpaque || all == 6 * tiles, "a tile that shows was left out");
@@ -98,7 +99,8 @@ struct Hidden {
         }
     }
 
-    // By hand: rank 0 hides what the next one has, which waits for the word and then sends nothing.
+    // By hand: rank 0 hides the input of the next rank, which waits until it is told and then sends nothing that
+    // counts.
     template <class Transport>
     static void byHand(const typename Transport::Communicator& communicator, Result& result)
     {
@@ -141,8 +143,8 @@ struct Hidden {
         }
     }
 
-    // Rank 0 says that it may hide what the next one has, then hides it in some tiles and shows it in others, or never
-    // says a word more: then the other one waits no longer than config.quiet.
+    // Rank 0 says that it may hide the inputs of the next rank. Then it hides them in some tiles and shows them in
+    // others, or says nothing more; in that case the next rank waits no longer than config.quiet.
     template <class Transport>
     static void waiting(const typename Transport::Communicator& communicator, Result& result)
     {
@@ -172,7 +174,7 @@ struct Hidden {
                 else
                     frame.show(t, 1, other);
             }
-            // By the thread of this rank; a minute is for ever.
+            // Waits on this rank's thread, for at most a minute.
             const auto wait = [&](const std::function<bool()>& done) {
                 for (int tries = 0; tries < 3000 && !frame.waitForWord(done); ++tries) {
                 }
@@ -196,7 +198,7 @@ struct Hidden {
         }
     }
 
-    // Where the image has depths all that there is counts.
+    // If the image has depths, hidden inputs count as well.
     template <class Transport>
     static void withDepth(const typename Transport::Communicator& communicator, Result& result)
     {

@@ -1,4 +1,5 @@
-// ImageCompositor: one picture out of finished images, compared with a composition in double that shares no code.
+// ImageCompositor: makes one picture of finished images. It is compared with a composition in double that shares no
+// code. In one process and over MPI (everywhere.hpp).
 
 #include <dfb/image_compositor.hpp>
 
@@ -58,7 +59,7 @@ Source sourceAt(int rank, int x, int y, bool hasStraightAlpha)
     return s;
 }
 
-// In the picture, from its upper left corner. Ranks differ, and the third one has nothing.
+// The valid part of a rank's image, counted from the picture's upper left corner. Ranks differ, and rank 2 has nothing.
 dfb::Region validOf(int rank)
 {
     const int inset = 9 * rank;
@@ -70,7 +71,7 @@ dfb::Region validOf(int rank)
 
 bool isIn(const dfb::Region& r, int x, int y) { return x >= r.x0 && x < r.x1 && y >= r.y0 && y < r.y1; }
 
-// A rank's image in memory, with what must not be read around it.
+// A rank's image in memory, surrounded by values that must not be read.
 struct OwnImage {
     std::vector<std::uint8_t> bytes;
     std::vector<float> floats, depths;
@@ -78,7 +79,7 @@ struct OwnImage {
 
     OwnImage(int rank, const Form& form, bool hasDepth)
     {
-        dfb::Region valid = validOf(rank); // as its own rows are counted
+        dfb::Region valid = validOf(rank); // in the image's own row order
         if (form.bottomUp)
             valid = {valid.x0, imageHeight - valid.y1, valid.x1, imageHeight - valid.y0};
         if (valid.width() <= 0)
@@ -88,7 +89,7 @@ struct OwnImage {
         const auto pixels = static_cast<std::size_t>(row * held.height());
         bytes.assign(form.isFloat ? 0 : 4 * pixels, 199);
         floats.assign(form.isFloat ? 4 * pixels : 0, std::numeric_limits<float>::quiet_NaN());
-        depths.assign(pixels, -1.0f); // would be in front of all
+        depths.assign(pixels, -1.0f); // in front of everything, if it were read
         for (int y = valid.y0; y < valid.y1; ++y)
             for (int x = valid.x0; x < valid.x1; ++x) {
                 const Source s = sourceAt(rank, x, form.bottomUp ? imageHeight - 1 - y : y, form.hasStraightAlpha);
@@ -116,7 +117,7 @@ struct OwnImage {
         image.valid = valid;
     }
 
-    // Brings the image to memory that other ranks see, as long as the result lives; bytes to an odd address.
+    // Moves the image to memory that other ranks see, as long as the result lives. Bytes begin at an odd address.
     dfb::Buffer moveTo(const dfb::ImageCompositor& compositor)
     {
         dfb::Buffer memory = compositor.sharedMemory(bytes.size() + 4 * floats.size() + 4 * depths.size() + 1);
@@ -127,7 +128,7 @@ struct OwnImage {
             std::memcpy(end, values.data(), values.size() * sizeof values[0]);
             pointer = reinterpret_cast<std::decay_t<decltype(pointer)>>(end);
             end += values.size() * sizeof values[0];
-            values.assign(values.size(), 77); // nobody reads it there
+            values.assign(values.size(), 77); // nobody may read the old place
         };
         move(floats, image.rgba32f);
         move(depths, image.depth);
@@ -144,7 +145,7 @@ struct Expected {
     float depth = std::numeric_limits<float>::infinity();
 };
 
-// `placeOf(rank)`: where it is in the order.
+// `placeOf(rank)` is the rank's place in the order.
 template <class PlaceOf>
 Expected expectedAt(int x, int y, int ranks, dfb::ImageBlend blend, const Form& form, bool hasDepth,
                     const PlaceOf& placeOf)
@@ -170,7 +171,8 @@ Expected expectedAt(int x, int y, int ranks, dfb::ImageBlend blend, const Form& 
         for (std::size_t c = 0; c < 4; ++c)
             e.rgba[c] += through * s.levels[c] / 255.0 * (form.hasStraightAlpha && c < 3 ? alpha : 1.0);
         through *= 1 - alpha;
-        // A pixel that is 0 in all channels is not there, unless its depth says so; colours are not above alpha.
+        // By depth, a pixel with alpha 0 does not count, as its colours are 0, too. For the nearest, the depth alone
+        // decides.
         if (hasDepth && (s.levels[3] > 0 || blend == dfb::ImageBlend::Nearest))
             e.depth = std::min(e.depth, s.depth);
     }
@@ -218,7 +220,7 @@ struct Images {
                         compositor.end();
                         if (compositor.isDisplayRank())
                             check(result, compositor.image(), form, blend, toBottomUp, hasDepth, ranks, placeOf);
-                        // Memory that stays: of this rank alone, and seen by others.
+                        // Memory that stays unchanged: visible to this rank only, or to others as well.
                         OwnImage own(compositor.rank(), form, hasDepth);
                         for (const bool isShared : {false, true}) {
                             const dfb::Buffer memory = isShared ? own.moveTo(compositor) : dfb::Buffer();
@@ -242,8 +244,8 @@ struct Images {
                 const Expected e = expectedAt(x, y, ranks, blend, form, hasDepth, placeOf);
                 const auto i = static_cast<std::size_t>((toBottomUp ? imageHeight - 1 - y : y) * imageWidth + x);
                 for (std::size_t c = 0; c < 4; ++c) {
-                    // Colours are floats on the way: a rounding of 2^-24 for each of 7 layers, twice where they are
-                    // multiplied by alpha.
+                    // Colours are floats on the way: they are rounded by 2^-24 for each of 7 layers, and twice if they
+                    // are multiplied by alpha.
                     constexpr double rounding = 14 * 0x1p-24;
                     if (isFloat)
                         wrong += !(std::abs(static_cast<double>(image.rgba32f()[4 * i + c]) - e.rgba[c])
@@ -261,7 +263,7 @@ struct Images {
     }
 };
 
-// 8-bit images travel as bytes, and give what floats of the same values give, bit for bit.
+// 8-bit images travel as bytes and give the same picture as floats of the same values, bit for bit.
 struct BytesAndFloats {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -273,7 +275,7 @@ struct BytesAndFloats {
             for (const auto blend : {dfb::ImageBlend::Nearest, dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder}) {
                 dfb::FrameBufferConfig config(imageWidth, imageHeight, format);
                 config.executor = executor;
-                config.image.ownerMap = dfb::latticeOwner; // both pictures go the same ways
+                config.image.ownerMap = dfb::latticeOwner; // both pictures have the same owners
                 dfb::ImageCompositor compositor(connection, blend, config);
                 const int place = blend == dfb::ImageBlend::InOrder ? compositor.rank() : -1;
                 std::vector<std::vector<std::byte>> pictures;
@@ -292,7 +294,7 @@ struct BytesAndFloats {
     }
 };
 
-// A pixel at infinite depth counts by its colour, in each form.
+// A pixel at infinite depth counts if it has a colour, in every form.
 struct AtInfinity {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -316,7 +318,7 @@ struct AtInfinity {
     }
 };
 
-// A rank that shows nothing needs no place in the order, one that shows something does.
+// A rank that shows nothing needs no place in the order; one that shows something needs one.
 struct Places {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -340,13 +342,13 @@ struct Places {
     }
 };
 
-// Wrong images and other sizes: the error is the same on all ranks, and the next picture is right.
+// Invalid images and other sizes: the error is the same on all ranks, and the next picture is right.
 struct Failures {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        const dfb::FrameBufferConfig config(imageWidth, imageHeight); // with the threads that it makes itself
+        const dfb::FrameBufferConfig config(imageWidth, imageHeight); // with its default executor
         dfb::ImageCompositor compositor(dfb::connect<Transport>(communicator), dfb::ImageBlend::Nearest, config);
         std::vector<std::uint8_t> pixels(4 * 300 * 200, 255);
         for (std::uint32_t i = 0; i < pixels.size(); ++i)
@@ -389,7 +391,7 @@ struct Failures {
         depthAlone.depth = depths.data();
         expectError(depthAlone, "depth alone", "with depth and without colour");
 
-        // Data that project to nothing: memory without a pixel, which nobody may read.
+        // An image without pixels, as of data outside the view: its pointers must not be read.
         dfb::InputImage nothing = good;
         nothing.rgba8 = reinterpret_cast<const std::uint8_t*>(16);
         nothing.depth = reinterpret_cast<const float*>(16);
@@ -422,7 +424,7 @@ struct Failures {
             expectGood(imageWidth, imageHeight, "startFailed()");
         }
 
-        // The second and the third are wider and higher than a strip may be.
+        // The second is wider and the third is higher than a strip may be.
         for (const auto& [width, height] :
              {std::make_pair(64, 31), std::make_pair(5000, 12), std::make_pair(6, 10000), std::make_pair(300, 200)}) {
             compositor.resize(width, height);

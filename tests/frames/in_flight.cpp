@@ -1,4 +1,4 @@
-// Several images in flight: they do not disturb each other.
+// Several frames in flight do not disturb each other. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 #include "send_all.hpp"
@@ -50,7 +50,7 @@ struct TwoFrames {
     }
 };
 
-// Frames of different loops, each begun before the one before has ended.
+// Frames of different loops, each begun before the frame before it has ended.
 struct LoopsInFlight {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -91,7 +91,7 @@ struct LoopsInFlight {
     }
 };
 
-// Two framebuffers of other sizes and operations, over one connection.
+// Two framebuffers of different sizes and operations, over one connection.
 struct TwoFrameBuffers {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)

@@ -1,5 +1,6 @@
-// Inputs that are read where they lie (TileView::staysUntilEnd): the image and the report are those of copied inputs,
-// bit for bit, also with pixels that are not as they should be, and a promise that is not kept is noticed.
+// Inputs that are read in the sender's memory (TileView::staysUntilEnd): image and report are those of copied inputs,
+// bit for bit, also if pixels are NaN or out of range. A rank that breaks its promise is noticed. In one process and
+// over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 
@@ -182,8 +183,8 @@ struct InPlace {
     }
 };
 
-// With checksums, a rank that changes pixels that it promised to leave alone makes the frame fail on all ranks, with
-// the tile; the next frame is good.
+// With checksums: if a rank changes pixels that it promised to leave alone, the frame fails on all ranks with an error
+// that names the tile, and the next frame is good.
 struct BrokenPromise {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)

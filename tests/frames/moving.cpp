@@ -1,4 +1,5 @@
-// Frames of a scene that changes: what a tile does not write again must still be there, and be what it is taken for.
+// Frames of a scene that changes: what a tile does not write again must still be in the image, and what ranks remember
+// of the last frame must still be true. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 #include "send_all.hpp"
@@ -12,12 +13,12 @@
 
 namespace frame_cases {
 
-// Bricks come, go and move; the background changes and changes back; frames fail in between, and all of it is compared
-// with the reference frame by frame.
+// Bricks come, go and move; the background changes and changes back; frames fail in between. Each frame is compared
+// with the reference.
 struct MovingBricks {
     static scene::Scene sceneOf(int frame)
     {
-        // Wide and low bricks, so that most rows of a tile have runs of both.
+        // Bricks are wide and low, so that most rows of a tile have runs of both brick and background pixels.
         scene::Scene s;
         s.width = 211, s.height = 67, s.seed = 5;
         s.background = frame % 7 < 4 ? std::array<float, 4>{0.125f, 0.25f, 0.0f, 0.5f} : std::array<float, 4>{};
@@ -80,14 +81,14 @@ struct MovingBricks {
     }
 };
 
-// Bricks move on a rank, from rank to rank, come and go, cameras turn and stand still, and frames fail before, during
-// and after their declarations: what ranks take for known from the last frame must be so. Each image is that of a fresh
-// framebuffer, bit for bit, in every loop that declares what it sends.
+// Bricks move within a rank and between ranks, come and go; cameras turn and stand still; frames fail before and after
+// their declarations. What ranks remember of the last frame must still be true. Each image is that of a new
+// framebuffer, bit for bit, in every loop that declares its inputs.
 struct ChangingDeclarations {
-    // Fails on one rank, before it has declared anything or when others have.
+    // When one rank fails: before it has declared its inputs, or when others have declared theirs.
     enum class Fails { Never, LookedUp, Rendered };
 
-    // Where the camera has turned to, in pixels. A culprit's throws.
+    // A camera that has turned by x and y pixels. On the rank that is to fail, it throws.
     struct Turned {
         int x = 0, y = 0;
         bool throws = false;
@@ -103,7 +104,7 @@ struct ChangingDeclarations {
 
     struct Step {
         const char* name;
-        std::vector<dfb::Brick> bricks; // as the camera does not see them
+        std::vector<dfb::Brick> bricks; // before the camera turns
         std::vector<int> holders;       // modulo the number of ranks
         Turned camera;
         Fails fails = Fails::Never;
@@ -140,7 +141,7 @@ struct ChangingDeclarations {
                 {"two have changed ranks", all, {0, 3, 2, 1}, {}}};
     }
 
-    // As the camera sees them.
+    // The bricks as the camera sees them.
     static scene::Scene sceneOf(const Step& step)
     {
         scene::Scene s = scene::makeScene(0, 3);

@@ -1,4 +1,5 @@
-// A loop of one's own, as Listing 3 of the paper: Frame::forEachTile() and exceptions in it.
+// A program's own loop, as Listing 3 of the paper: Frame::forEachTile() and exceptions in it. In one process and over
+// MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 
@@ -30,8 +31,8 @@ struct OwnLoop {
                                       fb.layout().region(tile))
                         .empty();
         };
-        // `check(tile)` is called for each input before it is sent. An own loop has two kinds of jobs: the backgrounds
-        // of this rank's tiles, and its bricks in all tiles.
+        // Calls `check(tile)` for each input before it is sent. The loop has two kinds of jobs: the backgrounds of this
+        // rank's tiles, and its bricks in all tiles.
         const auto render = [&](dfb::FrameConfig params, const auto& check) {
             auto frame = fb.begin(params);
             frame.forEachTile(fb.ownedTiles(), [&](auto& tile) {

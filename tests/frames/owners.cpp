@@ -1,4 +1,5 @@
-// Owners of tiles that change from frame to frame: given by hand, and those that loops find by the links of nodes.
+// Owners of tiles that change from frame to frame: set by hand, or chosen by loops from the links between nodes. In one
+// process and over MPI (everywhere.hpp).
 
 #include <dfb/image_compositor.hpp>
 
@@ -18,7 +19,7 @@ namespace frame_cases {
 template <class Op, class Transport>
 using OpFrameBuffer = dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport>;
 
-// Each rank is a node of its own.
+// Without shared memory, each rank counts as a node of its own.
 inline dfb::NetworkConfig far()
 {
     dfb::NetworkConfig network;
@@ -31,9 +32,9 @@ inline std::uint64_t hashOf(const dfb::Image& image)
     return dfb::testing::hashOf(image.rgba32f(), 16 * image.pixelCount());
 }
 
-// ---- by hand
+// ---- owners set by hand
 
-// Tiles move to other ranks and back, with and without a shared image, while what is background changes as well.
+// Tiles move to other ranks and back, with and without a shared image, while the background changes as well.
 struct Moving {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -129,9 +130,9 @@ struct Wrong {
     }
 };
 
-// ---- by links
+// ---- owners chosen by links
 
-// Boxes beside and behind each other, around which a camera goes.
+// Boxes beside and behind each other, which a camera circles.
 struct ByLinks {
     static std::vector<dfb::Brick> boxes()
     {
@@ -148,7 +149,7 @@ struct ByLinks {
 
     enum class Way { Data, Mixed, InOrder };
 
-    // Returns the hashes of the images, or none on other ranks; `bytes`: what all frames have sent.
+    // Returns the hashes of the images on the display rank, an empty list elsewhere. `bytes`: sent in all frames.
     template <Way way, class Transport>
     static std::vector<std::uint64_t> render(const typename Transport::Communicator& communicator, bool byLinks,
                                              std::int64_t& bytes)
@@ -211,7 +212,7 @@ struct ByLinks {
         result.expect(expected == got, name + ": another image");
         if (!got.empty())
             result.hash = scene::mix(result.hash ^ got.back());
-        // All ranks have the same count. One rank sends nothing.
+        // `bytes` is the same on all ranks. A single rank sends nothing.
         result.expect(lattice == 0 || 10 * byLinks < 9 * lattice,
                       name + ": " + std::to_string(byLinks) + " bytes, " + std::to_string(lattice) + " by the lattice");
     }
@@ -227,11 +228,11 @@ struct ByLinks {
     }
 };
 
-// Finished images whose places move: their owners go by those of the picture before.
+// Finished images that move: the owners follow from where the images of the last picture were.
 struct Pictures {
     static constexpr int width = 400, height = 300;
 
-    // Returns the hashes of the pictures; `bytes`: what the pictures from the second on have sent.
+    // Returns the hashes of the pictures. `bytes`: sent in all pictures from the second on.
     template <class Transport>
     static std::vector<std::uint64_t> render(const typename Transport::Communicator& communicator, bool isFar,
                                              bool byLinks, Result& result, std::int64_t& bytes)
@@ -251,7 +252,7 @@ struct Pictures {
                 pixels[i] = 0.25f + static_cast<float>(scene::mix(i + static_cast<std::uint64_t>(rank)) % 64) / 256;
             dfb::InputImage image(pixels.data());
             image.valid = {x, y, x + 120, y + 110};
-            if (n == 3) { // a rank fails; then all goes on
+            if (n == 3) { // one rank fails, and the others go on
                 const std::string outcome = scene::outcomeOf([&] {
                     if (rank == 0)
                         compositor.startFailed(std::make_exception_ptr(std::runtime_error("no picture")));

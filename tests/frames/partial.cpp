@@ -1,5 +1,5 @@
-// Frames that lose something: with allowPartial the rest of the image, and a list of what is missing; and frames that
-// are cancelled, from any rank and thread at any time.
+// Frames that lose inputs: with allowPartial, the rest of the image is there, with a list of what is missing. Frames
+// that are cancelled by any rank and thread at any time. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 #include "send_all.hpp"

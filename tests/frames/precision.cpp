@@ -1,4 +1,5 @@
-// Wire precision and early termination: errors within what was asked for and reported, the same on any ranks.
+// Wire precision and early termination: errors are within what was asked for and what is reported, for any number of
+// ranks. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 

@@ -1,5 +1,5 @@
-// Frames that miss an input, without a time-out: when all ranks are in end() and nothing is under way any more they
-// fail and say what is missing. Frames that are slow do not.
+// Frames that miss an input, without a time-out: they fail when all ranks are in end() and no message or work is under
+// way any more, and say what is missing. Slow frames do not fail. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 #include "send_all.hpp"

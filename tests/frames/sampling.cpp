@@ -1,4 +1,5 @@
-// Who renders which samples: distributions of work, accumulation over frames, adaptive sampling.
+// Which rank renders which samples: work distribution, accumulation over frames, adaptive sampling. In one process and
+// over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 

@@ -1,5 +1,5 @@
-// A TraceSink's events: they agree with the report of the frame, on every rank; messages pair up; clocks that differ
-// are put on one; frames that fail end their spans.
+// A TraceSink's events: they agree with the report of the frame on every rank; sends and receipts pair up; differing
+// clocks are aligned; frames that fail end their spans. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 #include "send_all.hpp"

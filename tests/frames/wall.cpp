@@ -1,4 +1,5 @@
-// Display walls: each display shows what the single image has in its place.
+// Display walls: each display shows what the single image has in its place. In one process and over MPI
+// (everywhere.hpp).
 
 #include "everywhere.hpp"
 

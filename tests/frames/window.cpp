@@ -1,4 +1,5 @@
-// What a window needs: frames that do not block, tiles as they come, other sizes.
+// What an interactive window needs: frames that do not block, tiles as they are finished, other sizes, frames of a
+// region. In one process and over MPI (everywhere.hpp).
 
 #include "everywhere.hpp"
 

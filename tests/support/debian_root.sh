@@ -87,7 +87,7 @@ make_root() {
     rm -rf --one-file-system "$root.new"
     debootstrap --variant=minbase --components="$3" "$2" "$root.new" "$1" >"$root.log" 2>&1 ||
         give_up "debootstrap failed: see $root.log"
-    echo force-unsafe-io >"$root.new/etc/dpkg/dpkg.cfg.d/fast" # if the system breaks, it is made again
+    echo force-unsafe-io >"$root.new/etc/dpkg/dpkg.cfg.d/fast" # a root that breaks is made again
     echo "127.0.0.1 localhost" >"$root.new/etc/hosts"
     mv "$root.new" "$root"
     rm "$root.log"
