@@ -9,7 +9,7 @@
 
 namespace frame_cases {
 
-// Along each ray there are 12 slots. Each is filled by one of three bricks or is empty.
+// A scene in which each ray has 12 slots. Each slot is filled by one of three bricks, or is empty.
 struct Interleaved {
     static constexpr int slots = 12, bricks = 3;
     int width = 61, height = 47;
@@ -64,7 +64,7 @@ struct Interleaved {
         return result;
     }
 
-    // Pixels in which the bricks' intervals, each from its first slot to its last, overlap.
+    // Number of pixels in which the intervals of bricks, each from its first slot to its last, overlap.
     std::int64_t overlapping() const
     {
         std::int64_t count = 0;

@@ -87,7 +87,7 @@ struct LoopsInFlight {
             open.front().end();
             open.pop_front();
         }
-        return result; // the last is not ended: it is cancelled
+        return result; // the last frame is not ended, so it is cancelled
     }
 };
 

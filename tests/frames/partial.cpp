@@ -14,7 +14,7 @@
 
 namespace frame_cases {
 
-// An operation that fails for one tile, if it is told so.
+// An operation that fails for one tile if it is told to.
 struct FailsAt {
     int tile = -1;
 };
@@ -38,8 +38,8 @@ private:
     bool fails_ = false;
 };
 
-// On the display rank: tiles that are complete are right, the others background; `missing` are among the latter. With
-// `exactly` there are no others: a machine that has too much to do may miss a time-out that was not meant for it.
+// On the display rank: complete tiles are right, and the others show the background. All of `missing` are incomplete;
+// with `exactly` no other tile is. Without, a busy machine may let a time-out pass that was not meant for other tiles.
 template <class FrameBuffer>
 void checkTiles(Result& result, const FrameBuffer& fb, const dfb::FrameReport& report, const scene::Scene& s,
                 const std::set<int>& missing, bool exactly, const std::string& what)
@@ -79,12 +79,12 @@ struct PartialFrames {
             auto params = paramsOf(s);
             params.allowPartial = true;
             const auto mine = bricksOf(s, fb.rank(), fb.size());
-            // A tile with the first brick in it, and the ones after.
+            // `lost`: the first tile that meets the first brick.
             const dfb::Region box = scene::FlatCamera().project(s.bricks[0].bounds, 0, 0);
             int lost = 0;
             while (dfb::intersection(box, fb.layout().region(lost)).empty())
                 ++lost;
-            constexpr int never = 20000, soon = 2000; // ms; enough for all but what is missing, on a busy machine
+            constexpr int never = 20000, soon = 2000; // ms; even if busy, enough for all that is not lost
             const dfb::World world(mine);
             dfb::DataParallelLoop loop(fb, world);
             const auto frame = [&](int timeoutMs, const auto& render, const FailsAt& fails) {
@@ -188,7 +188,7 @@ struct CancelledFrames {
                     auto frame = fb.begin(paramsOf(s));
                     const auto cancel = [&](int now) {
                         if (fb.rank() == who && when == now)
-                            std::thread([&] { frame.cancel(); }).join(); // any thread may
+                            std::thread([&] { frame.cancel(); }).join(); // any thread may cancel
                     };
                     cancel(AtOnce);
                     sendAll(fb, frame, s, false);
@@ -197,7 +197,7 @@ struct CancelledFrames {
                         sendAll(fb, frame, s, true);
                     cancel(BeforeEnd);
                     std::thread other;
-                    if (fb.rank() == who && when == InEnd) // which cannot come to an end without it
+                    if (fb.rank() == who && when == InEnd) // end() cannot return without it
                         other = std::thread([&] { frame.cancel(); });
                     const std::string outcome = scene::outcomeOf([&] { frame.end(); });
                     if (other.joinable())
@@ -218,7 +218,7 @@ struct CancelledFrames {
     }
 };
 
-// Of which frame the image is, if there is one.
+// Which frame the image is of, if there is an image.
 struct ImageOfFrame {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -229,7 +229,7 @@ struct ImageOfFrame {
             auto config = configOf(s, 2);
             config.framesInFlight = inFlight;
             dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator, config);
-            const bool isAlone = inFlight == 1; // then each frame has the memory of the last one
+            const bool isAlone = inFlight == 1; // then all frames share one image
             const auto expect = [&](std::int64_t frame, const std::string& when) {
                 const std::int64_t here = fb.isDisplayRank() ? frame : -1;
                 const std::string what = when + ", " + std::to_string(inFlight) + " in flight";
@@ -252,7 +252,7 @@ struct ImageOfFrame {
                 auto frame = fb.begin(paramsOf(s));
                 expect(isAlone ? -1 : last, "during a frame");
                 sendAll(fb, frame, s, false);
-                if (fb.rank() == fb.size() - 1) // when all but some inputs are there
+                if (fb.rank() == fb.size() - 1) // when all inputs but some are there
                     frame.abort(std::make_exception_ptr(std::runtime_error("on purpose")));
                 sendAll(fb, frame, s, true);
                 const std::string outcome = scene::outcomeOf([&] { frame.end(); });

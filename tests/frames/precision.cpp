@@ -16,7 +16,7 @@
 
 namespace frame_cases {
 
-// As renderBrick(), with colours that are within [0, alpha].
+// Like renderBrick(), with colours in [0, alpha].
 template <class Tile>
 void renderInRange(const scene::Scene& s, const dfb::Brick& brick, Tile& tile)
 {
@@ -90,7 +90,8 @@ struct Precision {
         result.expect(unknown.second.wireColor == dfb::WireFormat::Float16, "not known: not float16");
         check("early termination", frame(dfb::WireFormat::Float32, 0.05f, 0, true), static_cast<double>(0.05f));
         check("both", frame(dfb::ErrorBudget{0.06}, 0.05f, 5, true), 0.06);
-        // Emission is not in range: such tiles are exact, the bound of others knows what may shine through.
+        // Emissive colours are above alpha. Such tiles are sent exactly, and the error bound of the others accounts for
+        // them.
         const auto emission = frame(dfb::WireFormat::Float32, 0, 0, false);
         const auto lossy = frame(dfb::WireFormat::Unorm16, 0, 0, false);
         double worst = 0;
@@ -102,7 +103,7 @@ struct Precision {
     }
 };
 
-// An input with such an alpha is exact, but how much of rounded ones it lets through is not known.
+// An input with an alpha outside [0, 1] is exact, but how much it lets through of rounded inputs is not known.
 struct AlphaOutside {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -127,7 +128,7 @@ struct AlphaOutside {
     }
 };
 
-// HalfLevel: images of floats, and what stays within a node, are exact; no 8-bit level is off by more than one.
+// HalfLevel: float images, and inputs that stay within a node, are exact. No 8-bit level is off by more than one.
 struct WithinHalfALevel {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -141,7 +142,7 @@ struct WithinHalfALevel {
             bool hasFarRanks = false;
             for (int other = 0; other < connection->size(); ++other)
                 hasFarRanks = hasFarRanks || (other != connection->rank() && !connection->sharesMemoryWith(other));
-            // 200 layers are too many for 16 bits and half a level of sRGB, whose curve is steep where it is dark.
+            // With 200 layers, 16 bits are not enough for half a level of sRGB, whose curve is steep in the dark.
             for (const auto& [format, layers] :
                  {std::make_pair(dfb::OutputFormat::RGBA8, 5), std::make_pair(dfb::OutputFormat::RGBA8, 200),
                   std::make_pair(dfb::OutputFormat::SRGBA8, 5), std::make_pair(dfb::OutputFormat::SRGBA8, 200),
@@ -191,8 +192,8 @@ struct WithinHalfALevel {
     }
 };
 
-// What travels beside the colour does not change with its format, however thin a layer is; and where all normals are
-// alike, their mean is that one.
+// Channels other than colour do not depend on the colour's format, however thin a layer is. If all normals are equal,
+// their mean is the same normal.
 struct OtherChannels {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -216,7 +217,7 @@ struct OtherChannels {
                     [&](const dfb::Brick& b, auto& tile) {
                         renderInRange(s, b, tile);
                         tile.forEachPixel([&](int x, int y, float* rgba, float&) {
-                            if (x % 3 == 0) // is rounded to 0, or not
+                            if (x % 3 == 0) // some are rounded to 0, some are not
                                 for (int c = 0; c < 4; ++c)
                                     rgba[c] *= x % 2 ? 0x1p-9f : 0x1p-45f;
                             const int i = (y - tile.region.y0) * 16 + x - tile.region.x0;
@@ -248,7 +249,7 @@ struct OtherChannels {
             for (std::size_t i = 0; i < 3 * n; ++i)
                 if (std::isfinite(depth[i / 3]))
                     worst = std::max(worst, std::abs(static_cast<double>(image.normal()[i] - normal[i % 3])));
-            // Products by alpha, the ratio of two alphas and the products by it are rounded to float.
+            // Products by alpha, the ratio of two alphas and the products by that ratio are rounded to float.
             result.expect(worst <= 4 * 0x1p-24, name + ": normals are off by " + std::to_string(worst));
             result.hash = result.hash * 31 + dfb::testing::hashOf(image.normal(), 12 * n);
         }
@@ -256,7 +257,7 @@ struct OtherChannels {
     }
 };
 
-// What cannot be is refused on all ranks.
+// Invalid precisions are refused on all ranks.
 struct NoPrecision {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)

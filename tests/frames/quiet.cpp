@@ -14,7 +14,7 @@
 
 namespace frame_cases {
 
-// Ranks look for it soon after they are in end(), and often.
+// With this configuration ranks check soon and often, once they are in end(), whether anything is still under way.
 inline dfb::FrameBufferConfig quickConfig(const scene::Scene& s, int threads = 1)
 {
     dfb::FrameBufferConfig config = configOf(s, threads);
@@ -22,7 +22,7 @@ inline dfb::FrameBufferConfig quickConfig(const scene::Scene& s, int threads = 1
     return config;
 }
 
-// With no threads the ranks' own ones move messages, too.
+// Without worker threads, the ranks' own threads also move messages.
 inline dfb::NetworkConfig optionsOf(int threads)
 {
     dfb::NetworkConfig options;
@@ -39,11 +39,12 @@ void sendInput(const FrameBuffer&, Frame& frame, int tile, int generation, std::
     input->generation = generation;
     input->source = source;
     input->children = children;
-    input->pixel(0, 0)[3] = 0.5f; // what is empty does not travel to the display rank
+    input->pixel(0, 0)[3] = 0.5f; // empty tiles do not travel to the display rank
     frame.setTile(*input);
 }
 
-// How end() of a frame ended on this rank: an error, what a partial frame says in its report, or neither.
+// How end() of a frame ended on this rank: the error that it threw, the failure in the report of a partial frame, or
+// none.
 template <class Frame>
 std::optional<dfb::ErrorInfo> failureOf(Frame& frame)
 {
@@ -54,7 +55,7 @@ std::optional<dfb::ErrorInfo> failureOf(Frame& frame)
     }
 }
 
-// All that a tile can wait for in vain.
+// Each kind of input that a tile can wait for in vain.
 struct MissingInputs {
     struct Case {
         const char* name;
@@ -69,7 +70,7 @@ struct MissingInputs {
         constexpr int lost = 5; // the tile
         Result result;
         const scene::Scene s = scene::makeScene(5, 3);
-        for (const int threads : {1, 0}) { // 0: the ranks' own threads do all
+        for (const int threads : {1, 0}) { // 0: the ranks' own threads do all work
             using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport>;
             FrameBuffer fb(communicator, quickConfig(s, threads), optionsOf(threads));
             const int last = fb.size() - 1;
@@ -134,7 +135,7 @@ struct MissingInputs {
     }
 };
 
-// Frames that could go wrong by it and must not: one that fails beside others that do not, and ranks that render long.
+// Frames that must not be taken for quiet: good frames open beside one that misses inputs, and ranks that render long.
 struct QuietOthers {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -157,7 +158,7 @@ struct QuietOthers {
         {
             config.framesInFlight = 2;
             FrameBuffer fb(communicator, config);
-            for (int round = 0; round < 2; ++round) { // the first of two misses half of its inputs, then the second
+            for (int round = 0; round < 2; ++round) { // the first frame misses half its inputs, then the second
                 auto first = fb.begin(paramsOf(s));
                 auto second = fb.begin(paramsOf(s));
                 sendAll(fb, first, s, false);
@@ -188,7 +189,7 @@ struct QuietOthers {
             sendAll(b, inB, s, true);
             isRight(b, inB.end(), "the other");
         }
-        for (const int threads : {0, 1}) { // the last rank renders while the others look a hundred times
+        for (const int threads : {0, 1}) { // the last rank still renders while the others check about a hundred times
             config = quickConfig(s, threads);
             config.quiet = std::chrono::milliseconds(1);
             FrameBuffer fb(communicator, config, optionsOf(threads));

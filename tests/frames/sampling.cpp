@@ -14,7 +14,7 @@
 
 namespace frame_cases {
 
-// One brick that every rank has, over the whole image.
+// A scene of one brick that every rank has and that covers the whole image.
 inline scene::Scene wholeScene(int width, int height, int passes)
 {
     scene::Scene s = scene::makeScene(1, 11, width, height, passes);
@@ -22,7 +22,7 @@ inline scene::Scene wholeScene(int width, int height, int passes)
     return s;
 }
 
-// The tile as if its sample were its pass: the scene knows no frames.
+// Renders a tile with its sample number as pass, as the scene knows only passes.
 template <class Tile>
 void renderSample(const scene::Scene& s, const dfb::Brick& brick, Tile& tile)
 {
@@ -71,8 +71,8 @@ struct Distributions {
     }
 };
 
-// Rank 0 is stuck in its first tile until the others have done more than their fair share of all, which they only can
-// if what is handed out on demand goes to them. (Over MPI ranks cannot see each other: there nobody is stuck.)
+// Rank 0 is stuck in its first tile until the others have rendered more than their fair share. They can do so only if
+// jobs are handed out on demand. (Over MPI, ranks do not see each other's counts, so no rank is stuck.)
 struct Dynamic {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -85,7 +85,7 @@ struct Dynamic {
         const int jobs = fb.layout().tileCount() * s.passes, fairShare = jobs - jobs / fb.size();
         const bool isStuck = fb.rank() == 0 && fb.size() > 1 && communicator.isInProcess;
         ofOthers = 0;
-        fb.allReduce({0}, decltype(fb)::Reduce::Sum); // so that nobody counts before
+        fb.allReduce({0}, decltype(fb)::Reduce::Sum); // so that no rank counts earlier
         std::atomic<std::int64_t> rendered{0};
         const auto report =
             dfb::ImageParallelLoop(fb, dfb::WorkDistribution::Dynamic)
@@ -110,7 +110,7 @@ struct Dynamic {
 
 // ---- accumulation ----------------------------------------------------------------------------------------------
 
-// Frames of 3, 1 and 5 samples, which some tiles get later than others, are as right as one frame of 9.
+// Frames of 3, 1 and 5 samples, some of which come later in some tiles, give the same image as one frame of 9 samples.
 struct Accumulation {
     template <class Op, class Transport>
     static void accumulate(const typename Transport::Communicator& communicator, Result& result, bool isData)
@@ -121,7 +121,7 @@ struct Accumulation {
         const int tiles = fb.layout().tileCount();
         const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
         std::uint64_t id = 0;
-        for (int run = 0; run < 2; ++run) { // the second time, what was accumulated is forgotten
+        for (int run = 0; run < 2; ++run) { // the second time, accumulation begins again
             s.seed += static_cast<std::uint64_t>(run);
             ++id;
             std::vector<int> taken(static_cast<std::size_t>(tiles), 0);
@@ -132,7 +132,7 @@ struct Accumulation {
                 auto plan = std::make_shared<std::vector<dfb::TileSamples>>();
                 for (int t = 0; t < tiles; ++t) {
                     int& had = taken[static_cast<std::size_t>(t)];
-                    const int target = wanted == 4 && t % 3 == 0 ? 3 : wanted; // some get none in the second frame
+                    const int target = wanted == 4 && t % 3 == 0 ? 3 : wanted; // some get none in frame 2
                     plan->push_back({had, target - had});
                     had = target;
                 }
@@ -169,7 +169,7 @@ struct Accumulation {
     }
 };
 
-// A rank that goes on where the others begin again is found, on all ranks; and then all can begin again.
+// If one rank accumulates on while the others begin again, all ranks get an error; then all can begin again.
 struct Reset {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -211,7 +211,7 @@ struct Reset {
 
 // ---- adaptive sampling -----------------------------------------------------------------------------------------
 
-// Light that a sample sees or does not, with a probability per pixel.
+// A scene in which each sample is lit or dark, with a probability for each pixel.
 struct NoisyScene {
     int width = 128, height = 128;
     std::function<double(int x, int y)> probability;
@@ -230,7 +230,7 @@ struct NoisyScene {
         });
     }
 
-    // Root mean square of colour and alpha against the expected value, in a region.
+    // Root mean square error of colour and alpha in a region, against the expected value.
     double error(const dfb::Image& image, const dfb::Region& region) const
     {
         double sum = 0;
@@ -261,7 +261,7 @@ inline dfb::FrameBufferConfig configOf(const NoisyScene& s)
     return config;
 }
 
-// A noisy disc before a flat background: as accurate as uniform sampling, with less.
+// A noisy disc in front of a flat background: adaptive sampling is as accurate as uniform sampling, with fewer samples.
 struct Adaptive {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -285,7 +285,7 @@ struct Adaptive {
                 },
                 sampler.next()));
         const double error = fb.isDisplayRank() ? s.error(fb.image(), all) : 0;
-        // Nothing was rendered that the sampler does not know of.
+        // All that was rendered was in the sampler's plans.
         const std::int64_t tiles = fb.allReduce({rendered.load()}, NoisyFrameBuffer<Transport>::Reduce::Sum).front();
         result.expect(tiles * 256 == sampler.samplesTaken(), "tiles were rendered for nothing");
         result.expect(sampler.samplesTaken() + sampler.samplesSaved()
@@ -312,7 +312,7 @@ struct Adaptive {
     }
 };
 
-// A dark scene: each tile has nothing but a bright corner of 4x4 pixels, seldom hit. None is given up.
+// A dark scene: each tile has one bright corner of 4x4 pixels, which few samples hit. No tile is given up too early.
 struct DarkCorners {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -331,7 +331,7 @@ struct DarkCorners {
         result.hash = dfb::testing::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
         for (int tile = 0; tile < fb.layout().tileCount(); ++tile) {
             const dfb::Region r = fb.layout().region(tile);
-            // The error that was promised is that of the block of 8x8 pixels that has the corner.
+            // The promised error holds for the block of 8x8 pixels with the corner.
             const double error = s.error(fb.image(), {r.x0 + 8, r.y0 + 8, r.x1, r.y1});
             result.expect(error <= 1.6 * maxError,
                           "tile " + std::to_string(tile) + " is off by " + std::to_string(error) + " after "

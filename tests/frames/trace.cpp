@@ -27,7 +27,7 @@ namespace frame_cases {
 using TraceKind = dfb::TraceEvent::Kind;
 using Records = std::vector<dfb::detail::TraceRecord>;
 
-// Keeps what it is told, as if the clock of its rank were ahead.
+// Keeps events, with times as if this rank's clock were ahead.
 class KeepingSink final : public dfb::TraceSink {
 public:
     explicit KeepingSink(std::chrono::nanoseconds ahead = {}) : ahead_(ahead) {}
@@ -56,7 +56,7 @@ private:
 
 using TracedBlend = dfb::BasicAlphaBlend<16>;
 
-// A framebuffer with a sink. Owners send finished tiles, so that all bytes are in messages.
+// A framebuffer with a sink. Without shared memory owners send their finished tiles, so all bytes are in messages.
 template <class Transport>
 struct Traced {
     Traced(const typename Transport::Communicator& communicator, std::chrono::nanoseconds aheadByRank = {},
@@ -72,7 +72,7 @@ struct Traced {
         fb = std::make_unique<FrameBuffer>(std::move(connection), config);
     }
 
-    // Of all ranks, on all ranks. Collective.
+    // The records of all ranks, on all ranks. Collective.
     std::vector<Records> all()
     {
         for (int round = 0; round < 10; ++round)
@@ -104,7 +104,7 @@ std::vector<dfb::TraceEvent> eventsOf(const Records& records, TraceKind kind, st
 
 double msOf(const dfb::TraceEvent& e) { return std::chrono::duration<double, std::milli>(e.end - e.begin).count(); }
 
-// Sends and receipts by sender, receiver and running number.
+// The send and receipt of each message, by sender, receiver and running number.
 using Journeys = std::map<std::array<int, 3>, std::pair<const dfb::TraceEvent*, const dfb::TraceEvent*>>;
 Journeys journeysOf(const std::vector<Records>& ranks)
 {
@@ -121,7 +121,7 @@ Journeys journeysOf(const std::vector<Records>& ranks)
     return all;
 }
 
-// Spans of a thread lie within each other or beside each other.
+// Whether any two spans of a thread are nested or disjoint.
 bool areNested(Records records)
 {
     std::stable_sort(records.begin(), records.end(), [](const auto& a, const auto& b) {
@@ -141,7 +141,7 @@ bool areNested(Records records)
     return true;
 }
 
-// Two frames at a time: every figure that both the report and the trace have is the same in both.
+// With two frames in flight, each figure that is both in the report and in the trace is the same in both.
 struct TraceAgrees {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -169,7 +169,7 @@ struct TraceAgrees {
         std::size_t pairs = 0;
         for (const auto& [key, journey] : journeysOf(ranks)) {
             if (!journey.first || journey.first->frame < 0)
-                continue; // the last of all() are under way
+                continue; // the last messages of all() are still under way
             const bool isWhole = journey.second && journey.second->byteCount == journey.first->byteCount
                                  && journey.second->message == journey.first->message
                                  && journey.second->frame == journey.first->frame;
@@ -197,7 +197,7 @@ struct TraceAgrees {
             longest = std::max(longest, msOf(eventsOf(records, TraceKind::Render, report.frame).at(0)));
             for (const dfb::TraceEvent& e : eventsOf(records, TraceKind::Send, report.frame)) {
                 const auto kind = static_cast<dfb::detail::MessageKind>(e.message);
-                if (dfb::detail::Mailbox::needsCredit(kind) || e.begin < verdicts[0].begin) { // the report has it
+                if (dfb::detail::Mailbox::needsCredit(kind) || e.begin < verdicts[0].begin) { // counted in the report
                     bytes += static_cast<double>(e.byteCount);
                     messages += 1;
                 }
@@ -220,7 +220,7 @@ struct TraceAgrees {
     }
 };
 
-// Clocks of ranks that are seconds apart, in one direction and the other.
+// The clocks of ranks are seconds apart, in either direction.
 struct ClocksApart {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -235,7 +235,7 @@ struct ClocksApart {
             sendAll(*traced.fb, frame, s, false);
             sendAll(*traced.fb, frame, s, true);
             frame.end();
-            const auto took = std::chrono::steady_clock::now() - begin; // long on a busy machine, as messages are then
+            const auto took = std::chrono::steady_clock::now() - begin; // long on a busy machine, as are messages
             const std::vector<Records> ranks = traced.all();
             const auto clocks = dfb::detail::TraceWriter(ranks).clocks();
             for (std::size_t r = 0; r < ranks.size(); ++r) {
@@ -256,7 +256,7 @@ struct ClocksApart {
     }
 };
 
-// A frame that a rank aborts, one that a rank leaves, and one that goes well.
+// One frame that a rank aborts, one that a rank leaves without end(), and one that succeeds.
 struct FailedFramesEnd {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)

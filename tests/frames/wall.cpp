@@ -36,7 +36,7 @@ struct Wall {
             result.expect(wall.imageFrame() == number && toWall.imageFrame() == -1, name + ": another frame");
             render(single, frame);
             result.expect(toWall.image().empty(), name + ": an image where there is to be none");
-            // Rank 0 has the single image; all get it to compare.
+            // Rank 0 has the single image, and sends it to all ranks to compare.
             std::vector<std::byte> pixels;
             if (single.isDisplayRank())
                 pixels.assign(single.image().bytes(),
@@ -116,7 +116,7 @@ struct Wall {
     }
 };
 
-// A tile that converged long ago is on the wall all the same, and a frame that failed leaves nothing behind.
+// A tile that converged long ago still appears on the wall, and a frame that failed leaves nothing there.
 struct WallProgressive {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -134,7 +134,7 @@ struct WallProgressive {
         dfb::AdaptiveSampler sampler(fb.layout(), {0.05, 2, 16, 4});
         dfb::ImageParallelLoop loop(fb);
         const auto render = [&](bool fails) {
-            // Noise on the left, where it takes many samples, none on the right.
+            // Noise on the left, which takes many samples; no noise on the right.
             const auto report = loop.render(
                 [&](auto& tile) {
                     tile.forEachPixel([&](int x, int y, float* rgba, float&) {
@@ -179,7 +179,7 @@ struct WallProgressive {
     }
 };
 
-// Frames that are not finished do not end the wall; those that are come once each, in order.
+// The wall goes on after frames that are not finish()ed. Those that are come once each, in order.
 struct WallSkips {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)

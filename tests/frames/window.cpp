@@ -19,7 +19,7 @@ namespace {
 template <class Transport>
 using WindowFrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport>;
 
-// Polls until the frame is done. Throws if that takes longer than any test may.
+// Polls until the frame is done. Throws after 20 seconds.
 template <class Frame>
 dfb::FrameReport pollToEnd(Frame& frame, int& polls)
 {
@@ -43,7 +43,7 @@ struct NotBlocking {
             dfb::NetworkConfig network;
             network.progress = progress;
             auto config = scene::configOf(s);
-            config.quiet = std::chrono::minutes(1); // no good frame waits for it
+            config.quiet = std::chrono::minutes(1); // no good frame waits for this
             WindowFrameBuffer<Transport> patient(communicator, config, network);
             config.quiet = std::chrono::milliseconds(5);
             WindowFrameBuffer<Transport> fb(communicator, config, network);
@@ -97,7 +97,7 @@ struct NotBlocking {
     }
 };
 
-// Each tile that has an input is told once, with its pixels in place.
+// onTile is called once for each tile with an input, when its pixels are in the image.
 struct TilesAsTheyCome {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -107,7 +107,7 @@ struct TilesAsTheyCome {
         auto config = scene::configOf(s);
         const dfb::TileLayout layout(s.width, s.height, 16);
         std::vector<std::atomic<int>> told(static_cast<std::size_t>(layout.tileCount()));
-        std::vector<std::vector<float>> rows(told.size()); // the first of each tile, as it was then
+        std::vector<std::vector<float>> rows(told.size()); // the first row of each tile, as it was during the call
         std::atomic<bool> throws{false};
         config.onTile = [&](int tile, const dfb::Region& pixels, const dfb::Image& image) {
             if (throws)
@@ -194,7 +194,7 @@ struct Sizes {
     }
 };
 
-// Every rank gets the image, with its depth, if it asks for it; and none if there is none.
+// imageOnAllRanks() gives every rank the image with its depth, or an empty image if there is none.
 struct EverywhereTheImage {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -223,7 +223,8 @@ struct EverywhereTheImage {
     }
 };
 
-// A frame of a region renders the tiles that meet it; the others keep what they show, whatever the scene is now.
+// A frame of a region renders the tiles that meet the region. The others keep their pixels, even if the scene has
+// changed.
 struct RegionOfInterest {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -231,7 +232,7 @@ struct RegionOfInterest {
         Result result;
         scene::Scene first = scene::makeScene(5), second = scene::makeScene(6);
         second.width = first.width, second.height = first.height;
-        second.background = {0.5f, 0.25f, 0.125f, 1}; // of the region alone
+        second.background = {0.5f, 0.25f, 0.125f, 1}; // shows in the region only
         WindowFrameBuffer<Transport> fb(communicator, scene::configOf(first));
         const dfb::Region region{20, 17, 41, 33};
         const auto render = [&](const scene::Scene& s, bool all) {

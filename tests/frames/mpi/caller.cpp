@@ -1,5 +1,5 @@
-// Progress by the caller: a rank that has left end() may go into calls of MPI that do not move messages of dfb, and
-// nobody may need it there.
+// Progress by the caller: a rank that has left end() may go into MPI calls that do not move messages of dfb. No other
+// rank may wait for it then. Over MPI, on any number of ranks.
 #include "catch.hpp"
 #include "random_scene.hpp"
 #include "ranks.hpp"
@@ -23,7 +23,7 @@ namespace {
 using Op = dfb::BasicOrderedBlend<64>;
 using Fb = dfb::DistributedFrameBuffer<Op>;
 
-// The program's own barrier. False if it takes more than 20 seconds; then messages are moved until it is over.
+// The program's own barrier. Returns false if it takes more than 20 seconds; then it moves messages until it is over.
 bool passesBarrier(Fb& fb, MPI_Comm comm = MPI_COMM_WORLD)
 {
     MPI_Request request = MPI_REQUEST_NULL;
@@ -40,7 +40,7 @@ bool passesBarrier(Fb& fb, MPI_Comm comm = MPI_COMM_WORLD)
     return inTime;
 }
 
-// The caller moves messages, all of them through MPI.
+// The caller moves messages, and all of them go through MPI.
 dfb::NetworkConfig byCaller()
 {
     dfb::NetworkConfig network;
@@ -81,13 +81,13 @@ TEST_CASE("Who has left end() is not needed to take what a frame did not need", 
                 frame.setTile(view);
             }
         };
-        // The owner has something opaque in front of all that the last rank sends; or the frame is cancelled first.
+        // The owner has an opaque input in front of all that the last rank sends, or the frame is cancelled first.
         if (rank == owner && !cancelled)
             send(0, last == owner ? 0 : 1);
         if (rank == last && last != owner)
             send(1, 0);
         if (cancelled && rank == 0)
-            std::thread([&] { frame.cancel(); }).join(); // any thread may
+            std::thread([&] { frame.cancel(); }).join(); // any thread may cancel
         try {
             frame.end();
         } catch (const dfb::FrameError& e) {
@@ -101,7 +101,7 @@ TEST_CASE("Who has left end() is not needed to take what a frame did not need", 
 TEST_CASE("Who comes last to a reduction has sent its result on when it leaves", "[mpi]")
 {
     const int rank = rankIn(MPI_COMM_WORLD);
-    MPI_Comm pair = MPI_COMM_NULL; // in which rank 0 waits for one message alone
+    MPI_Comm pair = MPI_COMM_NULL; // in which rank 0 waits for a single message
     MPI_Comm_split(MPI_COMM_WORLD, rank < 2 ? 0 : MPI_UNDEFINED, rank, &pair);
     if (pair == MPI_COMM_NULL)
         return;

@@ -1,4 +1,4 @@
-// What goes wrong, over MPI: the same error on every rank, no hang, and the next frame is right.
+// Errors over MPI, on any number of ranks: the same error on every rank, no hang, and the next frame is right.
 #include "catch.hpp"
 #include "random_scene.hpp"
 #include "ranks.hpp"
@@ -19,7 +19,7 @@ using scene::Loop;
 using scene::outcomeOf;
 using scene::Scene;
 
-// Throws on one rank, in add or finish.
+// A tile operation that throws on one rank, in add or finish.
 struct Faulty : dfb::BasicAlphaBlend<16> {
     struct FrameData {
         int rank = -1;
@@ -64,7 +64,7 @@ struct FaultyPixelOp {
 
 using FrameBuffer = dfb::DistributedFrameBuffer<Faulty, FaultyPixelOp>;
 
-// A good frame; whether its image was right.
+// Renders a good frame and returns whether its image is right.
 template <class Fb>
 bool goodFrame(Fb& fb, const Scene& s)
 {
@@ -72,7 +72,7 @@ bool goodFrame(Fb& fb, const Scene& s)
     return !fb.isDisplayRank() || scene::wrongValues(scene::Picture(fb.image(), report), scene::referenceOf(s)) == 0;
 }
 
-// The ranks that are to blame in turn: the first, one in the middle, the last.
+// The ranks that in turn make the mistake: the first, one in the middle, the last.
 std::vector<int> culprits()
 {
     const int size = sizeOf(MPI_COMM_WORLD);
@@ -113,7 +113,7 @@ TEST_CASE("An exception on one rank fails the frame on all", "[errors]")
                 params.declared = true;
                 auto frame = fb.begin(params, {in == In::Add || in == In::Finish ? culprit : -1, in == In::Add},
                                       {in == In::PixelOp ? culprit : -1});
-                // Every rank has an input for every tile, so that every place is passed on every rank.
+                // Every rank has an input for every tile, so that every rank gets to each place where it may throw.
                 std::vector<dfb::TileInput> inputs;
                 for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
                     inputs.push_back({tile, static_cast<std::uint32_t>(fb.rank()), 0});
@@ -191,7 +191,8 @@ TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are
             const std::string text = outcomeOf([&] {
                 auto frame = fb.begin();
                 const auto tile = std::make_unique<decltype(fb)::Tile>();
-                // Tile 5 only: the others stay incomplete, so the frame does not end before the mistake is there.
+                // Only tile 5 gets inputs. The other tiles stay incomplete, so the frame does not end before the
+                // mistake arrives.
                 if (fb.rank() == culprit)
                     for (const Input& input : mistake.inputs) {
                         frame.start(*tile, 5);

@@ -1,4 +1,5 @@
-// Frames over MPI with a transport that reorders, delays, repeats, loses and damages messages.
+// Frames over MPI, on any number of ranks, with a transport that reorders, delays, repeats, loses and damages messages.
+// Each frame must end in the right image or in an error of dfb.
 #include "fault_frames.hpp"
 #include "catch.hpp"
 #include "ranks.hpp"
@@ -15,7 +16,7 @@ namespace faults_cases {
 
 namespace {
 
-// Every rank's texts, without waiting inside MPI.
+// Gathers the texts of all ranks without waiting inside MPI.
 std::vector<std::string> gathered(const std::string& mine)
 {
     constexpr int length = 1024;
@@ -37,12 +38,12 @@ TEST_CASE("Disturbed frames over MPI end in the right image or in an error of df
 {
     int frames = 0, right = 0, failed = 0;
     const auto counts = std::make_shared<dfb::testing::FaultCounts>();
-    // A communicator that is not shut down in order is not freed, and there may be a thousand or two of them.
+    // A communicator that is not shut down in order is not freed, and MPI has only one or two thousand.
     for (std::uint64_t seed = 500; seed < 580; ++seed) {
         scene::FaultGroup group = scene::faultGroup(seed);
         group.faults.counts = counts;
         if (group.op != scene::FaultGroup::Op::Sorted)
-            continue; // the others have their turn without MPI
+            continue; // the other operations are tested without MPI
         const auto expected = scene::referenceOf(group.scene);
         constexpr int most = 6;
         const scene::Limit limit("seed " + std::to_string(seed));

@@ -1,4 +1,5 @@
-// The image over MPI: right by the serial reference, and bit for bit that of ranks in one process.
+// The image over MPI, on any number of ranks: right by the serial reference, and bit for bit that of ranks in one
+// process.
 #include "catch.hpp"
 #include "random_scene.hpp"
 #include "ranks.hpp"
@@ -21,7 +22,7 @@ using scene::Scene;
 using Blend = dfb::BasicAlphaBlend<16>;
 using Single = dfb::BasicImageParallel<16>;
 
-// On the display rank what the last of `frames` frames gave, elsewhere an empty picture.
+// On the display rank the image of the last of `frames` frames, on the others an empty picture.
 template <class TileOp, class Transport, class Communicator>
 Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config,
                   int deal = 0, const dfb::NetworkConfig& options = {}, int frames = 2)
@@ -43,7 +44,7 @@ Picture overMpi(MPI_Comm communicator, const Scene& s, Loop loop, const dfb::Fra
                : pictureOn<Single, dfb::MpiTransport>(communicator, s, loop, config, deal, options);
 }
 
-// The same with ranks in this process.
+// The image of as many ranks in this process.
 Picture inProcess(int ranks, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config)
 {
     Picture result;
@@ -201,7 +202,7 @@ TEST_CASE("A part of the ranks, and two framebuffers on different communicators 
                 CHECK(scene::wrongValues(Picture(fbPart.image(), reportPart), scene::referenceOf(part)) == 0);
         }
     }
-    CHECK(MPI_Comm_free(&half) == MPI_SUCCESS); // it is still the caller's
+    CHECK(MPI_Comm_free(&half) == MPI_SUCCESS); // the communicator still belongs to the caller
 }
 
 } // namespace images_cases

@@ -1,5 +1,5 @@
-// Credit, several framebuffers, repeated and damaged messages, time-outs and progress by the caller, over MPI. Any
-// number of ranks; every frame that could hang has a time-out.
+// Credit, several framebuffers, repeated and damaged messages, time-outs and progress by the caller. Over MPI, on any
+// number of ranks. Every frame that could hang has a time-out.
 #include "catch.hpp"
 #include "flood.hpp"
 #include "forward.hpp"
@@ -41,7 +41,7 @@ using scene::Scene;
 
 constexpr int longMs = 30000; // no frame takes so long
 
-// Messages that wait until a test lets them go.
+// Messages that are held back until a test releases them.
 struct Held {
     std::mutex mutex;
     std::vector<std::function<void()>> sends;
@@ -58,7 +58,7 @@ struct Held {
     }
 };
 
-// MPI, with messages lost, repeated, held back or changed on the sending side.
+// An MpiTransport that loses, repeats, holds back or changes messages on the sending side.
 class TamperingTransport : public Forward<dfb::MpiTransport> {
 public:
     enum class What { Pass, Lose, Twice, Hold };
@@ -113,7 +113,7 @@ Scene sceneFor(int bricks, std::uint64_t seed)
     return s;
 }
 
-// A good frame; whether its image was right.
+// Renders a good frame and returns whether its image is right.
 template <class Fb>
 bool goodFrame(Fb& fb, const Scene& s, Loop loop = Loop::Declared)
 {
@@ -121,7 +121,7 @@ bool goodFrame(Fb& fb, const Scene& s, Loop loop = Loop::Declared)
     return !fb.isDisplayRank() || scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s)) == 0;
 }
 
-// What came of it: "right", "wrong", or its error.
+// Renders a good frame and returns "right", "wrong", or its error.
 template <class Fb>
 std::string outcomeOfGoodFrame(Fb& fb, const Scene& s)
 {
@@ -151,9 +151,9 @@ TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging]")
                 CHECK(report.peakInboxBytes <= static_cast<std::int64_t>(fb.config().messages.poolBytes));
                 CHECK((report.peakInboxBytes > 0) == (ranks > 1));
             }
-            // A rank's memory: a pool in its inbox and on the way to it, a pool under way to others and one message
-            // more for each thread that sets tiles, what is just being added up; the manifests and small messages; the
-            // image. Blocks are up to 1.5 times as large as what is in them.
+            // The memory of a rank: a pool in its inbox and on the way to it; a pool under way to others, and one
+            // message more for each thread that sets tiles; what is just being added up; manifests and small messages;
+            // the image. Blocks are up to 1.5 times as large as their contents.
             const std::size_t message = dfb::detail::fragmentPrefix + 16 * 32 * 32;
             const auto threads = static_cast<std::size_t>(fb.executor().concurrency()) + 1;
             const std::size_t limit =
@@ -266,8 +266,8 @@ TEST_CASE("With checksums a changed byte is an error on every rank, and the next
         for (const int place : {9, 25, 70}) {
             std::atomic<bool> done{false};
             const auto damage = [&](int, const MessageHeader& header, dfb::Buffer& message) {
-                // One message of rank 1, in the second frame: in the first, its receiver may still be in the
-                // constructor.
+                // Damages one message of rank 1 in the second frame. In the first frame, its receiver may still be in
+                // the constructor.
                 if (header.kind == kind && header.number == 2 && rankIn(MPI_COMM_WORLD) == 1 && !done.exchange(true))
                     message.data()[std::min<std::size_t>(static_cast<std::size_t>(place), message.size() - 1)] ^=
                         std::byte{64};
@@ -280,7 +280,7 @@ TEST_CASE("With checksums a changed byte is an error on every rank, and the next
             bool right = true;
             const std::string text = outcomeOf([&] {
                 Scene mine = s;
-                // Long: a message that comes after its frame's end makes the next one fail.
+                // The time-out is long, as a message that comes after its frame has ended makes the next frame fail.
                 mine.timeout = std::chrono::milliseconds(20000);
                 right = goodFrame(fb, mine);
             });
@@ -326,7 +326,7 @@ TEST_CASE("Tiles of a cancelled frame that come in a later one are dropped and c
     });
     CHECK(has(text, "FrameError: dfb: frame cancelled: rank " + std::to_string(last)));
     fb.allReduce({0}, decltype(fb)::Reduce::Sum); // the frame is over on all
-    // A busy machine may look at the last of them when the next frame's verdict is already under way.
+    // On a busy machine the last of them may be looked at only when the next frame's verdict is already under way.
     std::int64_t late = 0;
     std::size_t wrong = 0;
     const std::int64_t expected = fb.size() > 1 ? sent : 0;
@@ -349,7 +349,7 @@ TEST_CASE("What is missing when the time is up is named on every rank, and the n
     const int last = sizeOf(MPI_COMM_WORLD) - 1;
     const int owner = dfb::DistributedFrameBuffer<Blend>(MPI_COMM_WORLD, configOf(s)).tileOwner(5);
     dfb::FrameConfig params;
-    // A rank may begin so much later than the others: they give it up after twice the time.
+    // So much later than the others may a rank begin the frame: they give it up after twice this time.
     params.timeout = std::chrono::milliseconds(2000);
     for (const bool declared : {true, false}) {
         params.declared = declared;
@@ -401,7 +401,7 @@ TEST_CASE("A lost message is an error in time on every rank", "[messaging]")
             TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, lose}, configOf(s));
             const std::string lost = outcomeOf([&] {
                 Scene mine = s;
-                mine.timeout = std::chrono::milliseconds(1000); // enough for all but what is lost, on a busy machine
+                mine.timeout = std::chrono::milliseconds(1000); // enough for all but the lost message, even if busy
                 goodFrame(fb, mine);
             });
             return std::pair(lost, outcomeOfGoodFrame(fb, s));
@@ -434,7 +434,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
     dfb::DistributedFrameBuffer<Counter> fb(MPI_COMM_WORLD, config, options);
     {
         auto frame = fb.begin(scene::paramsOf(s));
-        MPI_Barrier(MPI_COMM_WORLD); // rank 0 is done with what makes it move messages by itself
+        MPI_Barrier(MPI_COMM_WORLD); // rank 0 has left the calls in which it moves messages by itself
         const auto tile = std::make_unique<decltype(fb)::Tile>();
         if (rank > 0)
             for (const dfb::Brick& brick : scene::bricksOf(s, rank, size))
@@ -475,7 +475,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
     CHECK(goodFrame(fb, s));
 }
 
-// 3 GiB of memory on the first and the last rank.
+// Takes 3 GiB of memory on the first and the last rank.
 TEST_CASE("A message of more than 2 GiB comes whole", "[messaging][.stress]")
 {
     struct Inbox : dfb::TransportHandler {

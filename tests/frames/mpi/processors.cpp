@@ -1,4 +1,4 @@
-// Which ranks of a node share processors, by their CPU masks.
+// Which ranks of a node share processors, found from their CPU masks. Over MPI, on any number of ranks.
 #include "catch.hpp"
 
 #include "ranks.hpp"
@@ -76,14 +76,16 @@ TEST_CASE("Ranks whose CPU masks meet divide the processors; those with masks of
         CHECK(fb.executor().concurrency() == report.threads);
     }
 
-    // One processor each, in turn: those that come to the same one share it.
+    // Each rank has one processor, dealt out in turn. Ranks with the same processor share it.
     share({everybodys[static_cast<std::size_t>(rank % processors)]});
     int same = 0;
     for (int other = 0; other < size; ++other)
         same += other % processors == rank % processors;
     CHECK(sharingRanks() == same);
 
-    // Rank 0 has all, the others one of them: it meets all, they do not meet each other unless by the same one.
+    // Rank 0 has all processors, each other rank has one. Rank 0 shares with all, the others only with rank 0 and with
+    // ranks
+    // that have the same processor.
     share(rank == 0 ? everybodys : std::vector<int>{everybodys[static_cast<std::size_t>(rank % processors)]});
     same = 0;
     for (int other = 0; other < size; ++other)

@@ -1,4 +1,5 @@
-// The image of the display rank, into which the owners of its node write themselves.
+// The image of the display rank, into which owners on its node write finished tiles themselves. Over MPI, on any number
+// of ranks; some cases need ranks that see each other's memory.
 #include "catch.hpp"
 #include "everywhere.hpp"
 #include "large_image.hpp"
@@ -24,7 +25,7 @@ namespace {
 using scene::Picture;
 using scene::Scene;
 
-// Like AlphaBlend, but its end takes long where and when it is told to.
+// Like AlphaBlend, but finish() of one tile takes long on one rank, if it is told to.
 std::atomic<int> slowTile{-1};
 std::atomic<bool> isThere{false}, mayGoOn{false};
 class SlowBlend : public dfb::BasicAlphaBlend<16> {
@@ -87,7 +88,7 @@ TEST_CASE("Owners that see the image of the display rank send it no tiles", "[sh
     }
     const int others = seesNextRank(MPI_COMM_WORLD) ? sizeOf(MPI_COMM_WORLD) - 1 : 0;
     CHECK(messages[true] == messages[false] - others);      // a batch each
-    CHECK((others == 0 || bytes[true] > bytes[false] / 2)); // what they put there counts all the same
+    CHECK((others == 0 || bytes[true] > bytes[false] / 2)); // the bytes that they write there count
 }
 
 TEST_CASE("From an owner that does not leave the image is taken away", "[shared_image]")
@@ -121,7 +122,7 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
             mayGoOn = true;
         });
         Scene impatient = s;
-        impatient.timeout = std::chrono::milliseconds(2000); // by then rank 1 has long been at that tile
+        impatient.timeout = std::chrono::milliseconds(2000); // rank 1 has been at that tile for long by then
         impatient.allowPartial = allowPartial;
         const std::string text =
             scene::outcomeOf([&] { report = scene::renderLoop(fb, impatient, scene::Loop::Declared); });
@@ -133,7 +134,7 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
             result.expect(scene::has(text, "timed out"), text);
         if (rank == 0) {
             result.expect(fb.image().empty() == !allowPartial, "an image, or none");
-            // Who still writes costs its tiles, and no others.
+            // An owner that still writes costs the image its own tiles and no others.
             const Picture after(fb.image(), report);
             const std::size_t width = static_cast<std::size_t>(s.width), pixelBytes = dfb::bytesPerPixel(before.format);
             int lost = 0, wrong = 0;
@@ -168,7 +169,8 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
         CHECK(undisturbedRanks([&] { return runCase(allowPartial); }).wrong == "");
 }
 
-// More than the ranks of a node share (NodeMemory::capacity): finished tiles are lent, or go through MPI.
+// The image is larger than what ranks of a node share (NodeMemory::capacity). Finished tiles are lent or go through
+// MPI.
 TEST_CASE("A float image of 2.25 GiB gets to the display rank, lent and through MPI", "[.stress]")
 {
     for (const bool shared : {false, true}) {

@@ -1,5 +1,6 @@
-// Many framebuffers and frames, one after the other: sizes, cameras, bricks, loops and communicators change, some
-// frames are cancelled or fail; memory does not grow, and no thread, file descriptor or communicator is left behind.
+// Many framebuffers and frames, one after the other: sizes, cameras, bricks, loops and communicators change, and some
+// frames are cancelled or fail. Memory must not grow, and no thread, file descriptor or communicator may be left
+// behind. Over MPI, on any number of ranks.
 #include "catch.hpp"
 #include "random_scene.hpp"
 #include "ranks.hpp"
@@ -14,7 +15,7 @@
 
 namespace soak_cases {
 
-// Sanitizers keep memory that was freed, to find who uses it.
+// Sanitizers keep freed memory, to find code that uses it.
 #if defined(__SANITIZE_ADDRESS__)
 #define SOAK_WITHOUT_MEMORY
 #elif defined(__has_feature)
@@ -27,7 +28,7 @@ namespace {
 
 using scene::mix;
 
-// Of this process.
+// Threads, open files and memory of this process.
 struct Holdings {
     long threads = 0, files = 0;
     double megabytes = 0; // resident
@@ -53,7 +54,7 @@ struct Holdings {
     }
 };
 
-// Of a communicator and all that were made of it, how many there are: each has the attribute.
+// Counts a communicator and all that were duplicated from it: each has the attribute.
 class Communicators {
 public:
     Communicators() { MPI_Comm_create_keyval(copied, freed, &key_, nullptr); }
@@ -86,7 +87,7 @@ private:
     std::atomic<int> count_{0}; // any thread may duplicate
 };
 
-// One framebuffer on a part of the ranks, and `frames` frames; what is wrong with them, or nothing.
+// Makes one framebuffer on a part of the ranks and renders `frames` frames. Returns what is wrong with them, or "".
 std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
 {
     const std::uint64_t h = mix(seed);
@@ -112,7 +113,7 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
                 wrong += "frame " + std::to_string(frame) + ": " + outcome + "\n";
             continue;
         }
-        if (frame % 9 == 2) { // seen from elsewhere in each
+        if (frame % 9 == 2) { // seen from another place each time
             const auto at = static_cast<float>(frame), x = static_cast<float>(s.width) / 2,
                        y = static_cast<float>(s.height) / 2;
             const dfb::PerspectiveCamera camera({x - 10 * at, y, -50 - 5 * at}, {x, y, 0}, {0, 1, 0}, 60);
@@ -150,10 +151,10 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
     return wrong;
 }
 
-// Framebuffers on parts of the ranks, until there have been so many frames.
+// Makes framebuffers on parts of the ranks, until `frames` frames were rendered.
 void soak(int frames)
 {
-    constexpr int each = 20, warmUp = 5; // rounds, in which MPI makes what it keeps for good
+    constexpr int each = 20, warmUp = 5; // rounds; in the first ones MPI allocates what it keeps for good
     Communicators communicators;
     Holdings before;
     for (int round = 0; round < frames / each; ++round) {
@@ -175,8 +176,8 @@ void soak(int frames)
     CHECK(after.threads == before.threads);
     CHECK(after.files == before.files);
 #if !defined(SOAK_WITHOUT_MEMORY)
-    // The largest framebuffers come later, and MPI and malloc keep more for them: about 2 MB, with 7 ranks. To lose
-    // 256 KB with each framebuffer is more than this.
+    // The largest framebuffers come later, and MPI and malloc keep more memory for them: about 2 MB with 7 ranks. A
+    // leak of 256 KB for each framebuffer would be more than this limit.
     CHECK(after.megabytes < before.megabytes + 8);
 #endif
 }
