@@ -1,4 +1,5 @@
-// Auxiliary channels in every operation: positions and ids need no depth in the image; Verified compares them.
+// Auxiliary channels in every operation: positions and ids need no depth in the image, and Verified compares all
+// channels. Ranks are threads.
 #include "aux.hpp"
 #include "catch.hpp"
 
@@ -35,7 +36,7 @@ scene::Scene sceneOf(dfb::BlendRule rule, bool isSingle, int passes)
     return s;
 }
 
-// One frame of the scene, or as many as it has passes, each of which adds one to what was accumulated.
+// Renders one frame of the scene, or, to accumulate, a frame of one sample for each of its passes.
 template <class Op>
 void render(FrameBuffer<Op>& fb, const scene::Scene& s, bool accumulates,
             const typename FrameBuffer<Op>::TileFrameData& data = {})
@@ -153,7 +154,7 @@ namespace {
 
 enum class Damage { None, Depth, Normal, Albedo, Position, PrimitiveId, InstanceId };
 
-// An operation that gives the first row of each tile something wrong.
+// An operation that makes the first row of each tile wrong in one channel.
 template <Damage What>
 struct Damaged : Blend {
     void finish(dfb::FinishedTile& out)
@@ -236,7 +237,7 @@ TEST_CASE("Verified finds nothing wrong with the library's operations, in all ch
 
 TEST_CASE("Verified notices what is wrong in any channel", "[channels]")
 {
-    // The first rows of the tiles that have an input are wrong in each column.
+    // In each column, the first row of each tile with an input is wrong.
     const std::int64_t wrong = wrongOthers<Damage::Depth>();
     CHECK(wrong >= 61);
     CHECK(wrongOthers<Damage::None>() == 0);

@@ -1,4 +1,5 @@
-// CompressionMode: the image is the same, and all ranks try and choose alike.
+// CompressionMode: the image is the same, and all ranks make the same tries and choices. Errors of codecs. Ranks are
+// threads.
 #include "catch.hpp"
 #include "random_scene.hpp"
 
@@ -48,7 +49,7 @@ TEST_CASE("Frames with and without compression take turns until all ranks have c
 
 namespace {
 
-// Counts its calls; on some ranks it finds nothing to gain.
+// A codec that counts its calls. On some ranks it never gains anything.
 class CountingCodec final : public dfb::Codec {
 public:
     explicit CountingCodec(bool gains) : gains_(gains) {}
@@ -106,7 +107,7 @@ TEST_CASE("A rank for which nothing is gained gets its messages as they are", "[
 
 namespace {
 
-// Fails when it is told to.
+// A codec that fails if it is told to.
 class FailingCodec final : public dfb::Codec {
 public:
     enum class At { Nothing, Bound, Compress, Decompress };
@@ -138,8 +139,8 @@ private:
     dfb::SnappyCodec snappy_;
 };
 
-// What two ranks get of a frame in which the codec of one of them fails for finished tiles, and whether the next frame
-// is right. Each rank renders the tiles that it owns: no input travels.
+// The errors of two ranks in a frame in which the codec of one of them fails for finished tiles, and whether the next
+// frame is right. Each rank renders the tiles that it owns, so no input travels.
 struct FailedFrame {
     std::vector<dfb::ErrorInfo> errors = std::vector<dfb::ErrorInfo>(2);
     std::int64_t incomplete = -1;
@@ -211,7 +212,7 @@ TEST_CASE("Finished tiles that cannot be decompressed are lost to a partial fram
         CHECK(error.message == "this codec cannot");
         CHECK(error.rank == 0);
     }
-    CHECK(frame.incomplete == 14); // those of the other rank
+    CHECK(frame.incomplete == 14); // the tiles of the other rank
     CHECK(frame.complete == 14);
     CHECK(frame.wrongAfter == 0);
 }

@@ -1,5 +1,5 @@
-// What a frame costs, in bytes, messages and allocations: counted, as a clock would have to be believed. And what is
-// said of an allocation that fails.
+// What a frame costs in bytes, messages and allocations, which are exact, unlike times. And the errors of allocations
+// that fail. Ranks are threads.
 #include "catch.hpp"
 
 #include <dfb/dfb.hpp>
@@ -33,7 +33,7 @@
 namespace {
 
 std::atomic<std::int64_t> allocations{0};
-std::atomic<std::size_t> largestAllocation{std::numeric_limits<std::size_t>::max()}; // a larger one fails
+std::atomic<std::size_t> largestAllocation{std::numeric_limits<std::size_t>::max()}; // larger allocations fail
 
 void* allocate(std::size_t bytes, std::size_t alignment)
 {
@@ -49,7 +49,7 @@ void* allocate(std::size_t bytes, std::size_t alignment)
 }
 
 #if defined(__GNUC__)
-__attribute__((noinline)) // or the compiler takes it for a mistake
+__attribute__((noinline)) // else the compiler warns of a mismatched free
 #endif
 void release(void* block)
 {
@@ -58,7 +58,7 @@ void release(void* block)
 
 } // namespace
 
-// Those of the whole program.
+// Replaces operator new of the whole program.
 void* operator new(std::size_t bytes) { return allocate(bytes, 1); }
 void* operator new[](std::size_t bytes) { return allocate(bytes, 1); }
 void* operator new(std::size_t bytes, std::align_val_t a) { return allocate(bytes, static_cast<std::size_t>(a)); }
@@ -77,12 +77,13 @@ namespace {
 
 constexpr int ranks = 4, side = 512, tileSide = 64, tileCount = (side / tileSide) * (side / tileSide);
 
-// Every box covers the image.
+// A camera in which every box covers the image.
 struct WholeImage {
     dfb::Region project(const dfb::Box3&, int, int) const { return {0, 0, side, side}; }
 };
 
-// The last of some frames of the same picture: each rank has an image of which the first `rows` rows have something.
+// The report of the last of some frames of the same picture. Each rank has an image of which only the first `rows` rows
+// are active.
 template <class TileOp>
 dfb::FrameReport cost(int rows)
 {
@@ -122,18 +123,19 @@ dfb::FrameReport cost(int rows)
     return result;
 }
 
-// What travels of `pixels` active pixels of all ranks to be composited: those whose owner is another rank.
+// The bytes that must travel if all ranks have `rows` active rows: inputs whose owner is another rank, and finished
+// tiles.
 double expectedBytes(double rows, double bytesPerPixel)
 {
-    return (ranks - 1) * rows * side * bytesPerPixel  // each rank has all tiles, and owns one in four
-           + (ranks - 1.0) / ranks * side * rows * 4; // the finished ones, 8 bits a channel
+    return (ranks - 1) * rows * side * bytesPerPixel  // each rank has all tiles and owns one in four
+           + (ranks - 1.0) / ranks * side * rows * 4; // finished tiles, 8 bits a channel
 }
 
 } // namespace
 
 TEST_CASE("A frame sends its active pixels, and little else", "[counters]")
 {
-    // Rows by the tile, so that whole tiles are sent.
+    // The number of rows is a multiple of a tile, so that whole tiles are sent.
     for (const int rows : {64, 256, 512}) {
         const dfb::FrameReport sorted = cost<dfb::AlphaBlend>(rows), nearest = cost<dfb::DepthComposite>(rows);
         INFO(rows << " rows: " << sorted.bytesSent << " bytes, expected at least " << expectedBytes(rows, 20));
@@ -142,7 +144,7 @@ TEST_CASE("A frame sends its active pixels, and little else", "[counters]")
             CHECK(static_cast<double>(c.bytesSent) <= expectedBytes(rows, 20) * 1.01 + 64 * 3 * tileCount + 4096);
         }
     }
-    // Half a tile is a half, and rows that are not there cost nothing.
+    // Half a tile costs half as much, and empty rows cost nothing.
     const double half = static_cast<double>(cost<dfb::AlphaBlend>(32).bytesSent),
                  whole = static_cast<double>(cost<dfb::AlphaBlend>(64).bytesSent);
     const double inputs = (ranks - 1) * 64.0 * side * 20;
@@ -217,7 +219,8 @@ TEST_CASE("A tile that has converged is not rendered, and nothing of it travels"
     INFO(reports[1].messagesSent << ", " << reports[2].messagesSent << " messages");
     CHECK(reports[1].messagesSent >= inputs / 2);
     CHECK(reports[1].messagesSent <= inputs / 2 + 8 * ranks);
-    // That all have declared and the verdict, both up and down, and that there are no tiles.
+    // The messages say that all ranks have declared and what the verdict is, both up and down, and that there are no
+    // tiles.
     CHECK(reports[2].messagesSent <= 5 * (ranks - 1));
     CHECK(reports[2].bytesSent <= 5 * (ranks - 1) * 1024); // the verdict has an error of each tile that was finished
 }
@@ -228,7 +231,8 @@ TEST_CASE("A frame of nothing costs next to nothing", "[counters]")
     INFO("bytes " << empty.bytesSent << " of " << full.bytesSent << ", messages " << empty.messagesSent << " of "
                   << full.messagesSent);
     CHECK(static_cast<double>(empty.bytesSent) <= 0.001 * static_cast<double>(full.bytesSent));
-    // That all have declared and the verdict, both up and down, and that there are no tiles.
+    // The messages say that all ranks have declared and what the verdict is, both up and down, and that there are no
+    // tiles.
     CHECK(empty.messagesSent <= 5 * (ranks - 1));
 }
 
@@ -238,7 +242,7 @@ TEST_CASE("A rank tells owners of its inputs if they have changed, and only thos
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config;
         config.image.width = config.image.height = side;
-        config.image.format = dfb::OutputFormat::None; // finished tiles travel in messages of which time says how many
+        config.image.format = dfb::OutputFormat::None; // the number of messages with finished tiles depends on time
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         using Fb = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport>;
         Fb fb(communicator, config);
@@ -266,9 +270,10 @@ TEST_CASE("A rank tells owners of its inputs if they have changed, and only thos
         frame(rank, rank == 3, FirstTile());                   // 7
         frame(rank + 50, rank == 3, FirstTile());              // 8: another one for that owner
     });
-    // Inputs of a rank to others. That all have declared goes up and down; the verdict itself is not counted.
+    // `inputs`: those of a rank to others. `rest`: that all have declared, up and down; the verdict itself is not
+    // counted.
     const std::int64_t inputs = tileCount - tileCount / ranks, rest = 2 * (ranks - 1);
-    const std::int64_t manifests = 2 * (ranks - 1); // of a rank, with the answers
+    const std::int64_t manifests = 2 * (ranks - 1); // of one rank, with their answers
     REQUIRE(messages.size() == 9);
     CHECK(messages[0] == ranks * inputs + rest + ranks * manifests);
     CHECK(messages[1] == ranks * inputs + rest);
@@ -293,7 +298,7 @@ TEST_CASE("Messages: one for each input, a few for each rank", "[counters]")
 #if !defined(COUNTERS_WITHOUT_ALLOCATIONS)
 namespace {
 
-// All ranks come here before any goes on; takes no memory.
+// A barrier for all ranks that allocates nothing.
 class Meeting {
 public:
     explicit Meeting(int count) : count_(count) {}
@@ -319,7 +324,7 @@ private:
 thread_local bool isWorker = false;
 std::array<std::atomic<int>, ranks> tilesOfWorker{}, tilesOfCaller{}; // composited, of each rank
 
-// An operation that counts who composites.
+// An operation that counts which thread composites.
 template <class TileOp>
 struct Watched : TileOp {
     void newFrame(const dfb::TileInfo& info)
@@ -341,8 +346,8 @@ void waitUntil(const std::atomic<int>& value, int least)
         std::this_thread::yield();
 }
 
-// How many blocks a pool holds is how many messages were under way at once, which depends on time. Here it gets as many
-// as there can ever be.
+// The number of blocks in a pool is the number of messages that were under way at once, which depends on time. This
+// gives the pool as many blocks as can ever be needed.
 void fill(dfb::MemoryPool& pool)
 {
     std::vector<dfb::Buffer> blocks;
@@ -356,9 +361,9 @@ void fill(dfb::MemoryPool& pool)
             blocks.push_back(pool.acquire(static_cast<std::size_t>(kilobytes) << 10));
 }
 
-// The allocations of each frame from the third on. Every rank has an image of all pixels. The first two frames are such
-// that in each rank the worker composites, and then the thread that waits for the frame: otherwise one of them may come
-// to do so for the first time in any later frame.
+// The number of allocations in each frame from the third on. Every rank has an image of all pixels. In the first two
+// frames, on each rank, first the worker composites and then the thread that waits for the frame. Otherwise one of them
+// might composite for the first time, and so allocate, in a later frame.
 template <class Base>
 std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
 {
@@ -405,7 +410,7 @@ std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
                 return loop.start(WholeImage(), dfb::inPlace(find), params);
         };
 
-        // By the worker.
+        // A frame composited by the worker.
         std::atomic<int> step{0};
         fb.executor().submit([&step] {
             isWorker = true;
@@ -418,7 +423,7 @@ std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
             frame.end();
         }
         meet();
-        // By this thread.
+        // A frame composited by this thread.
         fb.executor().submit([&step] {
             step = 2;
             waitUntil(step, 3);
@@ -479,7 +484,8 @@ TEST_CASE("From the third frame on the library allocates nothing", "[counters]")
 
 namespace {
 
-// Of each of some frames. With one worker and one rank nothing depends on time: any two frames will do.
+// The number of allocations in each of some frames. With one worker and one rank nothing depends on time, so the first
+// two frames may be any.
 template <class Frame>
 std::vector<std::int64_t> allocationsOf(const Frame& frame)
 {
@@ -514,7 +520,7 @@ TEST_CASE("On one rank it allocates nothing after two frames, into whatever is r
         };
         dfb::DataParallelLoop loop(fb, world), told(fb, world, all);
         CHECK(allocationsOf([&] { loop.render(WholeImage(), render); }) == std::vector<std::int64_t>(8));
-        // The camera moves, and the order of the bricks stays: that takes no memory. To project a brick does.
+        // The camera moves, and the order of the bricks stays the same, which takes no memory. Projecting a brick does.
         float x = 0;
         const auto next = [&x] {
             return dfb::PerspectiveCamera({-4 + (x += 0.01f), 0.5f, 6}, {1, 0.5f, 0.5f}, {0, 1, 0}, 40);
@@ -547,7 +553,7 @@ TEST_CASE("On one rank an image compositor allocates nothing after two frames", 
 
 namespace {
 
-// What each of 2 ranks gets where no allocation larger than that succeeds.
+// The error of each of 2 ranks if allocations larger than `largest` fail.
 template <class Make>
 std::vector<std::string> outcomes(std::size_t largest, const Make& make)
 {
@@ -573,7 +579,7 @@ namespace {
 
 using OneTile = dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::InprocTransport>;
 
-// Calls body(framebuffer, tile) on one rank with one worker, whose image is one tile.
+// Calls body(framebuffer, tile) on one rank with one worker. The image is a single tile.
 template <class Body>
 void withOneTile(const Body& body)
 {
@@ -625,7 +631,7 @@ TEST_CASE("A tile that there was no memory for can be set again", "[counters]")
 
 namespace {
 
-// From its third tile on there is no memory for another batch of finished tiles, which has 256 KiB.
+// From the third tile on, there is no memory for another batch of finished tiles, which takes 256 KiB.
 struct TakesMemory {
     std::shared_ptr<std::atomic<int>> tiles = std::make_shared<std::atomic<int>>(0);
     void process(dfb::PixelTile&) const
@@ -639,7 +645,7 @@ struct TakesMemory {
 
 TEST_CASE("A lack of memory for finished tiles costs a partial frame no other tile", "[counters]")
 {
-    const bool compresses = GENERATE(false, true); // then there is no memory for the compressed bytes of a batch either
+    const bool compresses = GENERATE(false, true); // true: no memory for a batch's compressed bytes either
     std::vector<std::int64_t> incomplete(2);
     int shown = 0;
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {

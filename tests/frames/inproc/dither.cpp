@@ -1,4 +1,5 @@
-// Dithered images: the same bit for bit whatever could get in between, and right by the reference.
+// Dithered images: right by the reference, and the same bit for bit for any ranks, tile sizes and owners. Ranks are
+// threads.
 #include "catch.hpp"
 #include "random_scene.hpp"
 
@@ -18,7 +19,7 @@ using scene::Scene;
 
 constexpr dfb::OutputFormat formats[] = {dfb::OutputFormat::RGBA8, dfb::OutputFormat::SRGBA8};
 
-// The second frame's image.
+// The image of the second frame.
 template <class TileOp, class PixelOp = dfb::NoPixelOp>
 Picture pictureOf(const Scene& s, int ranks, dfb::OutputFormat format, bool dither,
                   const dfb::OwnerMap& owners = dfb::latticeOwner)
@@ -40,7 +41,7 @@ Picture pictureOf(const Scene& s, int ranks, dfb::OutputFormat format, bool dith
     return result;
 }
 
-// Tiles of 12 begin where the pattern of 8 pixels does not.
+// Tiles of 12 pixels begin at other places than the dither pattern of 8 pixels.
 template <template <int> class TileOp, class PixelOp = dfb::NoPixelOp>
 std::vector<Picture> picturesOf(const Scene& s, dfb::OutputFormat format)
 {
@@ -56,7 +57,7 @@ std::vector<Picture> picturesOf(const Scene& s, dfb::OutputFormat format)
 template <int Size>
 using Blend = dfb::BasicAlphaBlend<Size>;
 
-// 9 bricks; some tiles stay background, of which no channel is a level, and green is as much as alpha.
+// 9 bricks. Some tiles stay background, none of whose channels is an exact 8-bit level, and whose green equals alpha.
 Scene sceneOf(int passes)
 {
     Scene s = scene::makeScene(9, 21, 97, 61, passes);
@@ -94,7 +95,7 @@ TEST_CASE("The same after a pixel operation", "[dither]")
 TEST_CASE("Dithered colour is that of the float image, alpha is exact and not exceeded", "[dither]")
 {
     for (const auto format : formats)
-        for (const int passes : {1, 3}) { // means of 3 have ties that are no binary numbers
+        for (const int passes : {1, 3}) { // means of 3 have ties that are not binary fractions
             const Scene s = sceneOf(passes);
             const auto exact = scene::referenceOf(s);
             const Picture floats = pictureOf<Blend<12>>(s, 3, dfb::OutputFormat::RGBA32F, false);

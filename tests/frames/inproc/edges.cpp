@@ -1,5 +1,5 @@
-// Edges: images and tiles of every odd size, data on few ranks, framebuffers made and gone in any order, user code that
-// has threads of its own.
+// Edges: images and tiles of every odd size, data on few ranks, framebuffers made and destroyed in any order, user code
+// with threads of its own. Ranks are threads.
 #include "catch.hpp"
 #include "large_image.hpp"
 #include "random_scene.hpp"
@@ -27,7 +27,7 @@ using Inproc = dfb::InprocTransport;
 template <class TileOp>
 using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Inproc>;
 
-// Values that are wrong in an image of `ranks` ranks; all bricks on the last one with deal -1.
+// Number of wrong values in an image of `ranks` ranks. With `deal` -1, the last rank has all bricks.
 template <int TileSize>
 std::size_t wrongIn(const scene::Scene& s, int ranks, int deal = 0)
 {
@@ -62,7 +62,7 @@ TEST_CASE("The smallest and the largest tiles, and what is between", "[edges]")
 {
     const scene::Scene s = scene::makeScene(5, 4, 300, 270);
     CHECK(wrongIn<8>(s, 3) == 0);
-    CHECK(wrongIn<24>(s, 3) == 0); // no power of two
+    CHECK(wrongIn<24>(s, 3) == 0); // not a power of two
     CHECK(wrongIn<256>(s, 3) == 0);
 }
 

@@ -1,5 +1,5 @@
-// What goes wrong: every call that cannot be right, every failure of a frame, and ranks that leave. The same error on
-// every rank, no hang, and the next frame is right.
+// Errors: every invalid call, every failure of a frame, and ranks that leave. Every rank gets the same error, none
+// hangs, and the next frame is right. Ranks are threads.
 #include "board.hpp"
 #include "catch.hpp"
 #include "forward.hpp"
@@ -34,7 +34,7 @@ using scene::outcomeOf;
 using scene::Picture;
 using scene::Scene;
 
-// A transport whose messages a test can look at, change and hold back.
+// A transport whose messages a test can inspect, change and hold back.
 struct Switchboard {
     enum class Verdict { Pass, Hold };
     // Called for each message to another rank, from any thread.
@@ -105,13 +105,13 @@ std::string joined(const std::vector<std::string>& texts)
     return all;
 }
 
-// The errors that each rank got out of one bad frame, and whether the good frame after it was right.
+// The errors of each rank in a bad frame, and the number of wrong values in the good frame after it.
 struct BadFrame {
     std::vector<std::string> texts;
     std::size_t wrongAfter = 1;
 };
 
-// `frame(fb)` runs the bad frame on each rank and may throw; after it comes a good one.
+// Calls `frame(fb)` on each rank, which renders the bad frame and may throw, then renders a good frame.
 template <class Fb, class Frame>
 BadFrame badFrame(int ranks, const Scene& s, const dfb::FrameBufferConfig& config, const Frame& frame, int threads = 1)
 {
@@ -121,7 +121,7 @@ BadFrame badFrame(int ranks, const Scene& s, const dfb::FrameBufferConfig& confi
         auto mine = config;
         if (threads > 0)
             mine.executor = std::make_shared<dfb::ThreadExecutor>(threads);
-        else // the rank's own thread looks at messages, in their order
+        else // the rank's own thread reads messages, in their order
             mine.executor = std::make_shared<dfb::CallerExecutor>();
         Fb fb(communicator, mine);
         result.texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { frame(fb); });
@@ -144,7 +144,7 @@ void send(Frame& frame, Tile& tile, int index, int generation, std::uint32_t sou
     frame.setTile(tile);
 }
 
-// An AlphaBlend that throws where it is told to.
+// An AlphaBlend that throws in one function on one rank.
 struct Faulty : dfb::BasicAlphaBlend<16> {
     enum class Where { Nowhere, NewFrame, Add, Finish };
     struct FrameData {
@@ -217,8 +217,8 @@ struct CopyCodec final : dfb::Codec {
     }
 };
 
-// What each rank got out of making a framebuffer when `change(rank, config)` was done to its configuration. A good one
-// on the same communicator follows.
+// The errors of all ranks when a framebuffer is made with a configuration that `change(rank, config)` has changed. Then
+// a good framebuffer is made on the same communicator.
 std::vector<std::string> constructed(int ranks, const std::function<void(int, dfb::FrameBufferConfig&)>& change)
 {
     std::vector<std::string> texts(static_cast<std::size_t>(ranks));
@@ -254,7 +254,7 @@ TEST_CASE("A tile that cannot be right is refused at once, and nothing is sent",
         config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
         using Fb = InspectedFrameBuffer<Blend>;
         Fb fb({communicator, board}, config);
-        // The frame comes to rank 0 when the bad calls are over: what is sent meanwhile was sent by them.
+        // Rank 0 begins the frame only when the bad calls are over, so any message sent until then comes from them.
         fb.allReduce({0}, Fb::Reduce::Sum);
         if (fb.rank() == 0)
             over.get_future().wait();
@@ -295,7 +295,7 @@ TEST_CASE("A tile that cannot be right is refused at once, and nothing is sent",
             texts.push_back(outcomeOf([&] { frame.setTile(view); }));
             sentMeanwhile = board->sent - before;
             over.set_value();
-            // None of it has harmed the frame.
+            // None of these calls has harmed the frame.
             for (int index = 0; index < 28; ++index)
                 for (const dfb::Brick& brick : s.bricks) {
                     frame.start(*tile, index);
@@ -379,7 +379,7 @@ TEST_CASE("Frame parameters that cannot be are refused", "[errors]")
 
 namespace {
 
-// A codec whose id means that there is none.
+// A codec with the id 0, which means that there is no codec.
 struct NamelessCodec : dfb::Codec {
     std::uint8_t id() const noexcept override { return 0; }
     std::size_t bound(std::size_t byteCount) const override { return byteCount; }
@@ -400,7 +400,7 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
         }
         return true;
     };
-    // Wrong on all, or on one.
+    // Invalid on all ranks, or on one.
     CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.image.width = 0; }));
     CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.image.height = 65537; }));
     CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.image.displayRank = -1; }));
@@ -414,7 +414,7 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
         if (rank == 1)
             c.messages.codec = std::make_shared<NamelessCodec>();
     }));
-    // Different on one.
+    // Different on one rank.
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.image.width += rank == 1; }));
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.image.height += rank == 0; }));
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) {
@@ -477,7 +477,7 @@ TEST_CASE("declare() at a wrong time or of what is not there is refused, and not
             const auto pairs = dfb::visibleTiles(world, scene::FlatCamera(), fb.layout());
             const auto inputs = dfb::inputsOf(world, pairs);
             std::vector<std::string> mine;
-            for (int round = 0; round < 3; ++round) { // what is refused must not be taken for what holds, either
+            for (int round = 0; round < 3; ++round) { // an input that was refused must not count in the next frame
                 dfb::FrameConfig params = paramsOf(s);
                 params.declared = true;
                 auto frame = fb.begin(params);
@@ -498,7 +498,7 @@ TEST_CASE("declare() at a wrong time or of what is not there is refused, and not
                 const auto report = frame.end();
                 if (fb.isDisplayRank())
                     wrong += scene::wrongValues(Picture(fb.image(), report), expected);
-                // Where nothing is declared.
+                // A frame in which nothing is declared.
                 params.declared = false;
                 auto other = fb.begin(params);
                 mine.push_back(outcomeOf([&] { other.declare(inputs); }));
@@ -558,7 +558,7 @@ TEST_CASE("A loop that fails before it has declared its inputs fails the frame a
 
 TEST_CASE("Ranks that wait for different things find out, and none waits for ever", "[errors]")
 {
-    // An empty scene: no input travels that could give the difference away.
+    // The scene is empty, so no input travels that could reveal the difference.
     const Scene s = scene::makeScene(0);
     for (const bool oddDeclares : {true, false})
         for (const int ranks : {2, 3, 5})
@@ -590,7 +590,7 @@ TEST_CASE("Ranks that wait for different things find out, and none waits for eve
 
 TEST_CASE("Ranks that were given other passes or samples find out, also where nobody waits for a time-out", "[errors]")
 {
-    // The odd one has no data and owns tiles: it waits for what is not rendered elsewhere, and the others for its
+    // The odd rank has no data and owns tiles. It waits for inputs that no rank renders, and the others wait for its
     // tiles.
     struct Case {
         bool samples;
@@ -632,7 +632,7 @@ struct Same {
     void process(dfb::PixelTile&) const {}
 };
 
-// What came of it where rank 0 is made with one type, rank 1 with another.
+// The errors if rank 0 makes a framebuffer of one type and rank 1 one of another.
 template <class One, class Other>
 std::vector<std::string> madeOf(const Scene& s)
 {
@@ -769,7 +769,7 @@ TEST_CASE("An exception in a tile operation fails the frame on every rank", "[er
 
 namespace {
 
-// Takes tiles at the border of the image for whole ones.
+// An operation that writes as many rows in border tiles as in whole ones.
 class TooManyRows : public Blend {
 public:
     void finish(dfb::FinishedTile& out)
@@ -802,7 +802,7 @@ TEST_CASE("Pixels outside a finished tile are refused, and nothing is written", 
 {
     std::vector<float> colors(4 * 8 * 8, 1.0f), depths(8 * 8, 1.0f);
     dfb::detail::Planes planes;
-    planes.at[dfb::detail::Color] = reinterpret_cast<std::byte*>(&colors[4 * 8]); // one row in, as the next two
+    planes.at[dfb::detail::Color] = reinterpret_cast<std::byte*>(&colors[4 * 8]); // begins at the second row, as do the depths
     planes.at[dfb::detail::Depth] = reinterpret_cast<std::byte*>(&depths[8]);
     dfb::FinishedTile tile({0, 0, 7, 5}, dfb::OutputFormat::RGBA32F, planes, 8);
     const std::vector<double> doubles(4 * 8);
@@ -830,7 +830,7 @@ TEST_CASE("Pixels outside a finished tile are refused, and nothing is written", 
 
 namespace {
 
-// A bad frame of a framebuffer with a FaultyPixelOp that throws on one rank.
+// A bad frame, in which a FaultyPixelOp throws on one rank, and a good one.
 template <bool Pointwise>
 BadFrame brokenPixelOp(int culprit, const Scene& s)
 {
@@ -990,7 +990,8 @@ TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are
 
 TEST_CASE("An input that comes when its owner has already voted does not vanish", "[errors]")
 {
-    // One too many, held back until the owner is done: an error on all ranks, and counted as late.
+    // The input is one too many and is held back until its owner has voted. It is an error on all ranks, and counted as
+    // late.
     const auto board = std::make_shared<Switchboard>();
     std::promise<void> ownerVoted, mayBegin;
     const auto mayBeginFuture = mayBegin.get_future().share();
@@ -1032,7 +1033,7 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
             }
             late[rank] += frame.end().lateMessages;
         });
-        // Late messages are in the next verdict, or in a later one if a busy machine looks at them so late.
+        // Late messages are counted in the next verdict, or in a later one if a busy machine reads them so late.
         for (int i = 0; i < 50 && late[rank] == 0; ++i) {
             auto frame = fb.begin();
             auto tile = std::make_unique<Fb::Tile>();
@@ -1049,7 +1050,7 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
 
 namespace {
 
-// Of two inputs where one was announced the other is there first; the announced one comes when all ranks have voted.
+// Only one of two inputs was announced. The other one comes first, and the announced one after all ranks have voted.
 template <class TileOp>
 std::vector<std::string> withInputTooMany(bool allowPartial)
 {
@@ -1291,7 +1292,7 @@ TEST_CASE("Messages of a frame that is over are counted and do no harm", "[error
                     send(frame, *tile, index, 0, 1, 0, 0);
             };
             {
-                // What rank 1 sends is on its way for long; rank 1 gives the frame up, rank 0 waits for its tiles.
+                // The messages of rank 1 are held back; rank 1 gives the frame up while rank 0 waits for its tiles.
                 auto frame = fb.begin();
                 if (fb.rank() == 1) {
                     for (int index = 0; index < 5; ++index)
@@ -1303,7 +1304,7 @@ TEST_CASE("Messages of a frame that is over are counted and do no harm", "[error
                 }
             }
             fb.allReduce({0}, Fb::Reduce::Sum); // the frame is over on both
-            // A busy machine may look at the last of them when the next frame's verdict is already under way.
+            // On a busy machine the last of them may be read only when the next frame's verdict is already under way.
             std::int64_t lateOfAll = 0;
             for (int i = 0; i < 2 || (lateOfAll < 5 && i < 50); ++i) {
                 auto frame = fb.begin(scene::paramsOf(s));
@@ -1364,8 +1365,8 @@ TEST_CASE("A rank that leaves by an exception outside frames: the others get a T
                     if (rank != culprit) {
                         const std::string& text = texts[static_cast<std::size_t>(rank)];
                         CHECK(has(text, "TransportError: dfb: transport failure: rank " + std::to_string(culprit)));
-                        // From runRanks(), or from the framebuffer or the connection that the exception passes on its
-                        // way there.
+                        // The exception reaches the others from runRanks(), or from the framebuffer or the connection
+                        // that it destroys first.
                         CHECK((has(text, "out of disk") || has(text, "an exception has ended its")));
                     }
             }
@@ -1386,7 +1387,7 @@ TEST_CASE("A rank that leaves before the framebuffer is made", "[errors]")
                     throw std::runtime_error("no input file");
                 }
                 leftFuture.wait();
-                // One after the other: the second sends to a rank that is gone.
+                // One after the other, so that the second rank sends to one that is gone.
                 const bool first = rank == (leaver == 0 ? 1 : 0);
                 if (!first)
                     firstGoneFuture.wait();
@@ -1414,7 +1415,7 @@ TEST_CASE("runRanks refuses a number of ranks that is none", "[errors]")
 
 namespace {
 
-// Sends what the tiles of this rank wait for.
+// Sends the inputs that this rank's tiles wait for.
 template <class Fb, class Frame>
 void sendOwned(Fb& fb, Frame& frame)
 {
@@ -1423,8 +1424,8 @@ void sendOwned(Fb& fb, Frame& frame)
         send(frame, *tile, index, 0, 0, 0, 0);
 }
 
-// How a partial frame of two ranks ended, and the one after it. Rank 0 gives up a tile, then all call `more(frame,
-// rank)`; `params(rank)` says with what a rank begins.
+// The outcomes of a partial frame of two ranks, and of the frame after it. In the partial frame rank 0 gives up a tile,
+// then all call `more(frame, rank)`. `params(rank)` returns the configuration of the frame on a rank.
 template <class Params, class More>
 std::vector<std::string> partialFrame(const Params& params, const More& more)
 {

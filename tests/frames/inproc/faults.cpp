@@ -1,4 +1,5 @@
-// Frames over a transport that reorders, delays, repeats, loses and damages messages.
+// Frames over a transport that reorders, delays, repeats, loses and damages messages. Each must end in the right image
+// or in an error of dfb. Ranks are threads.
 #include "catch.hpp"
 #include "fault_frames.hpp"
 
@@ -19,7 +20,7 @@ struct Tally {
     std::string wrong;                            // the first, with its seed
 };
 
-// Groups of frames, of all operations and loops, until there are `frames`.
+// Runs groups of frames, of all operations and loops, until there are `frames` frames.
 Tally faultGroups(std::uint64_t firstSeed, int frames)
 {
     Tally tally;

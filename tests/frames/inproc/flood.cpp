@@ -1,5 +1,5 @@
-// Credit: whatever the ranks send, what is on the way to a rank and in its inbox stays within its message pool, and it
-// ends. Ranks are threads; every test has a time limit.
+// Credit: whatever the ranks send, the messages on the way to a rank and in its inbox stay within its message pool, and
+// every frame ends. Ranks are threads; every test has a time limit.
 #include "flood.hpp"
 #include "board.hpp"
 #include "catch.hpp"
@@ -111,9 +111,9 @@ TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging][f
                     CHECK(r.messagesSent < 4 * inputs); // requests and credits
                     otherMessages += static_cast<std::size_t>(r.messagesSent - inputs);
                 }
-                // A rank's memory: a pool of inputs under way and one more for each thread that sets tiles, those that
-                // threads of the owner are just adding up, the small messages, the image. (In one process a message
-                // stays in the memory of its sender.)
+                // The memory of a rank: a pool of inputs under way and one more for each thread that sets tiles, the
+                // inputs that threads of the owner are just adding up, the small messages, the image. (In one process a
+                // message stays in its sender's memory.)
                 const std::size_t blocks = pool / fullMessage + 2 * static_cast<std::size_t>(threads);
                 const std::size_t limit = blocks * blockBytes(fullMessage) + otherMessages * 256
                                           + blockBytes(256 * 256 * 16) + 64 * blockBytes(4096);
@@ -227,8 +227,8 @@ TEST_CASE("An owner that takes nothing out of its inbox is sent no more than its
             auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(1));
             config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
             AddingFrameBuffer fb(communicator, config);
-            // The only worker of rank 0, and the thread that calls its framebuffer, are busy with something else until
-            // every other rank has set more than a pool's worth.
+            // Rank 0's only worker and its main thread are busy with something else until every other rank has set more
+            // than a pool's worth.
             const auto allBlocked = [&] {
                 std::unique_lock<std::mutex> lock(mutex);
                 changed.wait_for(lock, std::chrono::seconds(20),
@@ -280,7 +280,7 @@ TEST_CASE("The display rank is flooded by finished tiles", "[messaging][flood]")
         runOn(std::make_shared<Board>(), 5, [&, &make = makeExecutor](const auto& communicator) {
             auto config = floodConfig(800, make());
             config.image.displayRank = 3;
-            // The display rank has no tile of its own: 10 MB come to it.
+            // The display rank owns no tile, so 10 MB are sent to it.
             config.image.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile % 4 == 3 ? 4 : tile % 4; };
             AddingFrameBuffer fb(communicator, config);
             for (int i = 0; i < 2; ++i) {
@@ -373,7 +373,7 @@ TEST_CASE("What comes for a frame that is over does not take up room in the inbo
         dfb::FrameConfig params;
         params.declared = true;
         {
-            auto frame = fb.begin(params); // left by all
+            auto frame = fb.begin(params); // all ranks leave it without end()
             if (fb.rank() == 1)
                 for (int index = 0; index < 30; ++index)
                     sendOne(frame, index);
@@ -386,7 +386,7 @@ TEST_CASE("What comes for a frame that is over does not take up room in the inbo
         if (fb.rank() == 1)
             board->release();
         fb.allReduce({0}, AddingFrameBuffer::Reduce::Sum);
-        std::promise<void> tasksDone; // one worker does them in order
+        std::promise<void> tasksDone; // the only worker runs tasks in order
         fb.executor().submit([&] { tasksDone.set_value(); });
         tasksDone.get_future().wait();
         for (int i = 0; i < 2; ++i) {
@@ -401,7 +401,7 @@ TEST_CASE("What comes for a frame that is over does not take up room in the inbo
             }
         }
     });
-    // With the two words of having left.
+    // 30 inputs, and up to two messages that say that a rank has left.
     CHECK((late.size() == 2 && late[0] >= 30 && late[0] <= 32 && late[1] == 0));
     CHECK(peaks == std::vector<std::int64_t>(2, static_cast<std::int64_t>(fullMessage)));
 }
@@ -462,8 +462,8 @@ TEST_CASE("A flood with progress by the caller: setTile() makes the progress tha
 
 TEST_CASE("Who has voted on a partial frame that was cancelled sends no more inputs", "[messaging][flood]")
 {
-    // Their owner may have left the frame, and would give no credit for them. No input arrives before the frame is
-    // cancelled. Of the pool a quarter is the sender's without asking, and half of it on request.
+    // The owner may have left the frame, and would give no credit for further inputs. No input arrives before the frame
+    // is cancelled. A sender may use a quarter of the pool without asking, and half of it on request.
     constexpr int pool = 1 << 20, bytes = static_cast<int>(fullMessage);
     const auto board = std::make_shared<Board>();
     std::atomic<int> held{0};
@@ -522,7 +522,7 @@ TEST_CASE("A frame fails for damaged credit, also if what waits for it never goe
     board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
         if (header.kind != MessageKind::Credit || header.number != 1)
             return Board::What::Pass;
-        if (done.exchange(true)) // it would make good for the damaged one
+        if (done.exchange(true)) // the next credit would replace the damaged one
             return Board::What::Lose;
         message.data()[message.size() - 1] ^= std::byte{1};
         return Board::What::Pass;
@@ -553,8 +553,8 @@ TEST_CASE("A frame fails for damaged credit, also if what waits for it never goe
 
 TEST_CASE("What an owner keeps of inputs is their active bytes, once for each frame in flight", "[messaging][flood]")
 {
-    // 16 tiles with 8 full inputs and one that comes when all others have. The owner gets copies in memory of its own,
-    // as it does from another node.
+    // 16 tiles with 8 full inputs and one that comes after all others. The owner copies inputs to its own memory, as it
+    // does with those of another node.
     using Fb = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, BoardTransport>;
     constexpr int tiles = 16, parts = 8, side = dfb::AlphaBlend::tileSize, width = 4 * side;
     constexpr std::size_t active = std::size_t{20} * side * side;
@@ -582,7 +582,7 @@ TEST_CASE("What an owner keeps of inputs is their active bytes, once for each fr
             config.framesInFlight = frames;
             config.executor = std::make_shared<dfb::ThreadExecutor>(1);
             config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-            config.messages.poolBytes = std::size_t{1} << 30; // not what limits it here
+            config.messages.poolBytes = std::size_t{1} << 30; // so large that it limits nothing here
             const auto connection = dfb::connect<BoardTransport>(communicator);
             if (connection->rank() == 0)
                 ownersPool = connection->pool();

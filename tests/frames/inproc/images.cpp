@@ -1,4 +1,5 @@
-// The image of a frame: right by the serial reference, and the same bit for bit whatever could get in between.
+// The image of a frame: right by the serial reference, and the same bit for bit whatever the order of arrival, number
+// of ranks, threads, executor, owners and compression. Ranks are threads.
 #include "catch.hpp"
 #include "random_scene.hpp"
 #include "shuffled.hpp"
@@ -38,7 +39,7 @@ struct Options {
     bool depth = true;
     int displayRank = 0;
     int deal = 0;
-    int frames = 2; // the second one finds everything used
+    int frames = 2; // the second frame reuses everything
 };
 
 std::shared_ptr<dfb::Executor> makeExecutor(const Options& o)
@@ -64,7 +65,7 @@ dfb::FrameBufferConfig configOf(const Scene& s, const Options& o)
     return config;
 }
 
-// The last frame's image.
+// The image of the last frame.
 template <class TileOp>
 Picture picture(const Scene& s, const Options& o)
 {
@@ -228,7 +229,7 @@ TEST_CASE("Output formats, with and without depth", "[images]")
 
 TEST_CASE("Format None: no image, and no pixels to the display rank", "[images]")
 {
-    // All inputs stay where they are, so all that could travel is finished tiles.
+    // All inputs stay on their rank, so only finished tiles could travel.
     const Scene s = sceneFor(Loop::ImageOwned);
     Options o;
     o.loop = Loop::ImageOwned;
@@ -241,7 +242,7 @@ TEST_CASE("Format None: no image, and no pixels to the display rank", "[images]"
     CHECK(none.depth.empty());
     CHECK(none.report.tilesTouched == 28);
     CHECK(shown.report.bytesSent > 97 * 61 * 4 / 2);
-    // The verdict up the tree: one message of less than 256 bytes from each rank but rank 0.
+    // Only the verdict travels: one message of less than 256 bytes up the tree from each rank but rank 0.
     CHECK(none.report.messagesSent <= 3);
     CHECK(none.report.bytesSent < 3 * 256);
 }
@@ -256,8 +257,9 @@ TEST_CASE("Background does not travel", "[images]")
         const Picture p = picture<dfb::AlphaBlend>(s, o);
         CHECK(scene::wrongValues(p, scene::referenceOf(s)) == 0);
         CHECK(p.report.tilesTouched == 0);
-        // Per rank but one, of 4: a count of tiles, its part of the reduction that says all have declared (up and
-        // down), and of the verdict (up): at most 4 messages, together less than 512 bytes.
+        // For each of 4 ranks but one: its count of tiles, its part of the reduction that says that all ranks have
+        // declared (up and down), and its part of the verdict (up). These are at most 4 messages, together less than
+        // 512 bytes.
         CHECK(p.report.messagesSent <= 3 * 4);
         CHECK(p.report.bytesSent <= 3 * 512);
     }
@@ -270,7 +272,7 @@ TEST_CASE("Background does not travel", "[images]")
         const Picture p = picture<dfb::AlphaBlend>(s, o);
         CHECK(scene::wrongValues(p, scene::referenceOf(s)) == 0);
         CHECK(p.report.tilesTouched == 1);
-        // That tile as input (20 bytes a pixel) and finished (color and depth), and control messages.
+        // That tile as an input (20 bytes a pixel) and as a finished tile (colour and depth), and control messages.
         CHECK(p.report.bytesSent <= 64 * 64 * 20 + 64 * 64 * 20 + 4 * 1024);
     }
     SECTION("what was background stays it, in the next frame and with another colour")
@@ -320,7 +322,7 @@ TEST_CASE("Ordinary: odd sizes, few tiles, empty ranks", "[images]")
             CHECK(scene::wrongValues(pictureOf(s, o), scene::referenceOf(s)) == 0);
         }
     for (const Loop loop : {Loop::Listing3, Loop::Declared}) {
-        // Rank 0 without data; no data at all; bricks outside the image.
+        // Scenes in which rank 0 has no data, no rank has data, or the bricks are outside the image.
         Options o;
         o.loop = loop;
         o.deal = -1;

@@ -1,6 +1,6 @@
 // A rank that stops answering: the others name it within the time-out, in whatever call they wait, and can be
-// destroyed; a rank that is only slow, or was held itself, raises no alarm; who expects nothing sends nothing. Ranks
-// are threads, each with a progress thread of its own, which a test can hold.
+// destroyed. A rank that is only slow, or was itself held, raises no alarm. A rank that expects nothing sends nothing.
+// Ranks are threads, each with a progress thread of its own, which a test can hold.
 #include "board.hpp"
 #include "catch.hpp"
 #include "random_scene.hpp"
@@ -31,17 +31,17 @@ using scene::outcomeOf;
 using std::chrono::milliseconds;
 using Clock = std::chrono::steady_clock;
 
-// Long enough for a progress thread to have its turn on a machine that is busy with other things.
+// Long enough for a progress thread to get the processor on a busy machine.
 constexpr int timeoutMs = 1200;
-// How long after that many milliseconds an error may come, on a machine that is busy with other things.
+// How many ms later than that an error may come on a busy machine.
 constexpr double marginMs = 5000;
 constexpr std::uint64_t seed = 1; // messages are moved by poll()
 
 struct Holds {
     explicit Holds(int ranks) : held(static_cast<std::size_t>(ranks)), slowMs(held.size()), naps(held.size()) {}
-    std::vector<std::atomic<bool>> held;  // poll() of that rank does not return
-    std::vector<std::atomic<int>> slowMs; // it takes so long
-    std::vector<std::atomic<int>> naps;   // that it has taken
+    std::vector<std::atomic<bool>> held;  // while true, poll() of that rank does not return
+    std::vector<std::atomic<int>> slowMs; // poll() of that rank takes so long
+    std::vector<std::atomic<int>> naps;   // number of naps of that rank
 };
 
 class HeldTransport : public Forward<BoardTransport> {
@@ -101,21 +101,21 @@ FrameBuffer::Frame begin(FrameBuffer& fb)
 
 void emptyFrame(FrameBuffer& fb) { begin(fb).end(); }
 
-// What a rank got out of waiting for one that is lost.
+// The outcome on a rank that waited for a lost one.
 struct Told {
     std::optional<dfb::ErrorInfo> error;
     double ms = 0;    // from the moment when that rank was held
-    double endMs = 0; // that destruction took then
+    double endMs = 0; // that destruction then took
 };
 
-// Messages that only say or ask that somebody is there.
+// Whether a message only says or asks whether a rank is there.
 bool isSign(const MessageHeader& header)
 {
     return header.kind == MessageKind::Ping || header.kind == MessageKind::Pong;
 }
 
-// `wait(connection, fb)` is the call that the others are in when `victim` answers no more. `withFrameBuffer`: the
-// victim is held when that has been made and a first frame ended, else as soon as there is a connection.
+// Calls `wait(connection, fb)` on all ranks but `victim`, which no longer answers. The victim is held after the
+// framebuffer was made and a first frame has ended, or, without `withFrameBuffer`, as soon as there is a connection.
 std::vector<Told> lose(int ranks, int victim, bool withFrameBuffer,
                        const std::function<void(std::shared_ptr<dfb::Connection>, std::unique_ptr<FrameBuffer>&)>& wait)
 {
@@ -166,7 +166,7 @@ std::vector<Told> lose(int ranks, int victim, bool withFrameBuffer,
     return told;
 }
 
-// Returns after how many ms the first was told.
+// Checks the errors of all ranks. Returns after how many ms the first rank got its error.
 double checkTold(const std::vector<Told>& told, int victim)
 {
     double soonest = timeoutMs + marginMs;
@@ -174,7 +174,7 @@ double checkTold(const std::vector<Told>& told, int victim)
         INFO("rank " << rank << ", after " << told[rank].ms << " ms");
         CHECK(told[rank].endMs < marginMs);
         if (static_cast<int>(rank) == victim && !told[rank].error)
-            continue; // what it was to get was there already when it came back
+            continue; // its result was there already when it came back
         REQUIRE(told[rank].error);
         CHECK(told[rank].error->kind == dfb::ErrorKind::Transport);
         CHECK(told[rank].error->rank == victim);
@@ -234,12 +234,12 @@ TEST_CASE("A frame that is open while rendering fails when a rank is lost, and s
         frame.end();
     });
     checkTold(told, 2);
-    CHECK(failed >= 2); // the lost one may not even begin it
+    CHECK(failed >= 2); // the lost rank may not even begin the frame
 }
 
 TEST_CASE("The handler is called where a rank was found lost, once, and not on the others", "[lost_peers]")
 {
-    constexpr int ranks = 5, victim = 4; // only rank 0 listens for it
+    constexpr int ranks = 5, victim = 4; // only rank 0 listens for the victim
     const auto holds = std::make_shared<Holds>(ranks);
     std::vector<std::atomic<int>> calls(ranks);
     std::atomic<int> lost{-1}, over{0};
@@ -285,7 +285,7 @@ TEST_CASE("A rank that renders long, or polls slowly, raises no alarm", "[lost_p
             emptyFrame(fb);
             const auto rank = static_cast<std::size_t>(fb.rank());
             if (rank == 2)
-                holds->slowMs[rank] = 20; // others: 1 ms or so
+                holds->slowMs[rank] = 20; // the others take about 1 ms
             texts[rank] = outcomeOf([&] {
                 auto frame = begin(fb);
                 if (rank == 2)
@@ -373,7 +373,7 @@ TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few
             ++(isSign(header) ? signs : others);
             return Board::What::Pass;
         };
-        const int pairs = ranks - 1; // of neighbours in the tree
+        const int pairs = ranks - 1; // pairs of neighbours in the tree
         const int expected = peerTimeoutMs > 0 ? 2 * pairs : 0;
         std::atomic<int> out{0}, atStart{0}, idle{0}, silent{0}, napsIdle{0}, napsBefore{0}, begun{0};
         std::atomic<double> idleMs{0}, silentMs{0}; // as long as it took
@@ -434,7 +434,7 @@ TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few
             CHECK(silent == 0);
         } else {
             CHECK(silent > 0);
-            // No more than a question and an answer in each direction, for each quarter of the time-out.
+            // At most a question and an answer in each direction, for each quarter of the time-out.
             CHECK(silent <= pairs * 4 * 4 * (silentMs / timeoutMs + 1));
         }
         // Idle threads wake up once a second, or once in a quarter of the time-out if that is shorter.

@@ -1,5 +1,5 @@
-// Several framebuffers on one connection, messages that come twice or damaged, gathering, and progress by the caller:
-// what the messaging layer promises to frames. Ranks are threads; every test has a time limit.
+// What the messaging layer promises to frames: several framebuffers on one connection, repeated and damaged messages,
+// gathering, and progress by the caller. Ranks are threads; every test has a time limit.
 #include "board.hpp"
 #include "catch.hpp"
 #include "flood.hpp"
@@ -67,8 +67,8 @@ Scene sceneFor(Loop loop, std::uint64_t seed = 1)
 
 namespace {
 
-// Two frames open at once, of different operations and images, their calls interleaved; on each rank the images of
-// both on their display ranks were right.
+// Two frames of different operations and images are open at once, with interleaved calls. Returns whether the images on
+// both display ranks are right.
 template <class A, class B>
 bool interleaved(A& a, B& b, const Scene& sa, const Scene& sb, bool endFirst, bool abortB = false)
 {
@@ -132,7 +132,7 @@ TEST_CASE("Frames of two framebuffers on one connection, open at the same time; 
     Scene sb = scene::makeScene(1, 4, 70, 90);
     sb.bricks[0].bounds = {{0, 0, 0}, {70, 90, 1}};
     for (const int ranks : {1, 2, 5})
-        for (const bool shared : {true, false}) // else a connection each, on one communicator
+        for (const bool shared : {true, false}) // otherwise each has a connection, on one communicator
             for (const bool shuffle : {false, true}) {
                 INFO(ranks << " ranks" << (shared ? ", shared" : "") << (shuffle ? ", shuffled" : ""));
                 std::vector<std::string> texts(static_cast<std::size_t>(ranks));
@@ -157,7 +157,7 @@ TEST_CASE("Frames of two framebuffers on one connection, open at the same time; 
                         for (int i = 0; i < 4; ++i)
                             if (!interleaved(*a, *b, sa, sb, i / 2 == 0, i % 2 == 1))
                                 text += "wrong in round " + std::to_string(i) + "; ";
-                        // In any order.
+                        // Ranks destroy the two in different orders.
                         if (rank % 2 == 0)
                             a.reset(), b.reset();
                         else
@@ -173,7 +173,7 @@ TEST_CASE("Frames of two framebuffers on one connection, open at the same time; 
 TEST_CASE("A framebuffer made later on one rank gets what came for it before", "[messaging]")
 {
     const Scene s = sceneFor(Loop::Declared, 5);
-    for (const int late : {0, 2}) { // they hear of 1 and 2, and of 3, before they take part
+    for (const int late : {0, 2}) { // messages of ranks 1 and 2, or of rank 3, come before
         const int expected = late == 0 ? 2 : 1;
         const auto board = std::make_shared<Board>();
         std::mutex mutex;
@@ -310,7 +310,7 @@ TEST_CASE("Repeated messages are counted exactly, and a frame without any has no
                     frame.setTile(*tile);
                 }
             if (fb.rank() > 0 && round == 0 && --left == 0)
-                setAll.set_value(); // whatever comes twice has come
+                setAll.set_value(); // all repeated messages have come
             if (fb.rank() == 0 && round == 0)
                 setAll.get_future().wait_for(std::chrono::seconds(20));
             for (int index : fb.ownedTiles()) {
@@ -341,7 +341,7 @@ TEST_CASE("Copies that come when their frame is long over do no harm", "[messagi
         runOn(board, 3, [&](const BoardTransport::Communicator& communicator) {
             FrameBuffer<Blend> fb(communicator, configOf(s));
             for (int i = 0; i < 4; ++i) {
-                fb.allReduce({1}, FrameBuffer<Blend>::Reduce::Sum); // all are out of the frame before
+                fb.allReduce({1}, FrameBuffer<Blend>::Reduce::Sum); // all have left the frame before
                 if (i == 3 && fb.rank() == 1) {
                     copies = board->held.size();
                     board->release();
@@ -395,11 +395,11 @@ TEST_CASE("With checksums the image is the same", "[messaging]")
 
 namespace {
 
-// A peerTimeout within which a rank answers, on a machine that is busy with other things.
+// A peerTimeout within which a rank answers even on a busy machine.
 constexpr int peerMs = 1500;
 
-// How the second of three frames and the others ended when, with checksums, one byte of one message was changed: the
-// first of its kind in that frame. `place` counts from the message's start, or, negative, from its end.
+// The outcomes of three frames with checksums. One byte of one message was changed in the second frame: in the first
+// message of its kind. `place` counts from the message's start or, if negative, from its end.
 struct Damaged {
     bool done = false;
     std::vector<std::string> before, texts, after;
@@ -445,13 +445,13 @@ Damaged damagedFrame(MessageKind kind, std::uint32_t scope, int place, int timeo
         Scene nothing = s; // so that the next frame's inputs have to be declared
         nothing.bricks.clear();
         result.before[rank] = frame(nothing, 20000);
-        // Nobody is still in that frame, and a message that comes early is for the next.
+        // No rank is still in that frame, so a message that comes early belongs to the next frame.
         armed = true;
         if (--notReady == 0)
             mayGoOn.set_value();
         mayGoOnFuture.wait();
         result.texts[rank] = frame(s, timeoutMs);
-        // After a TransportError there is no other frame, on any rank.
+        // After a TransportError no rank can render another frame.
         result.after[rank] = has(result.texts[rank], "TransportError") ? "" : frame(s, 20000);
     });
     result.done = done;
@@ -487,7 +487,7 @@ TEST_CASE("With checksums a changed byte anywhere is an error, never a wrong ima
         for (const int place : {0, 2, 3, 4, 8, 16, 20, 24, -1})
             if (target.kind != MessageKind::ManifestAck || place != 24) // it has no body
                 cases.push_back({target, place});
-    constexpr int limitMs = 2000; // for a verdict that is lost; enough for all else, on a busy machine
+    constexpr int limitMs = 2000; // for a lost verdict; enough for all else, even if busy
     const auto runCase = [](const Case& c) { return damagedFrame(c.target.kind, c.target.scope, c.place, limitMs); };
     board::eachAtOnce(cases, runCase, [](const Case& c, const Damaged& d) {
         INFO(c.target.name << ", byte " << c.place << joined(d.texts) << "\n after it" << joined(d.after));
@@ -503,7 +503,7 @@ TEST_CASE("With checksums a changed byte anywhere is an error, never a wrong ima
             CHECK((text == "fine" || has(text, "FrameError: dfb: malformed message")
                    || has(text, "FrameError: dfb: timed out") || has(text, "TransportError")));
         }
-        // Who misses the verdict cannot fail a frame that the other has seen end well.
+        // A rank that misses the verdict cannot fail a frame that the other rank has seen end well.
         CHECK(errors >= 1);
         if (c.target.scope != FrameVerdict) {
             CHECK(d.texts[0] == d.texts[1]);
@@ -524,7 +524,7 @@ TEST_CASE("A damaged vote or verdict does not hang a frame that has no time-out"
             INFO((kind == MessageKind::ReduceUp ? "vote" : "verdict") << joined(d.texts));
             CHECK(d.done);
             CHECK(d.wrong == 0);
-            // Who has the verdict has a frame that ended well; it learns of the end of the others in the next one.
+            // For the rank that has the verdict the frame ended well. It gets the error in the next frame.
             CHECK(has(d.texts[1], "TransportError"));
             CHECK((kind == MessageKind::ReduceDown
                    || has(d.texts[0], "not all ranks have ended this frame after " + std::to_string(peerMs) + " ms")
@@ -604,7 +604,7 @@ TEST_CASE("With frames in flight a damaged message costs frames, not the framebu
     for (std::size_t rank = 0; rank < 2; ++rank) {
         INFO(texts[rank] << joined(after[rank]));
         CHECK(has(texts[rank], "FrameError: dfb: malformed message"));
-        // Nobody knows that it was not for this one.
+        // No rank can tell that the message did not belong to this frame.
         CHECK(has(after[rank][0], "FrameError: dfb: malformed message"));
         CHECK(after[rank][1] == "fine");
     }
@@ -687,7 +687,7 @@ TEST_CASE("Without a peerTimeout what is damaged during a reduction ends it, als
     board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer&) {
         if (header.kind != MessageKind::ReduceUp || !damages)
             return Board::What::Pass;
-        damage(); // what came of it
+        damage(); // the result of the damage
         return Board::What::Lose;
     };
     std::vector<std::string> texts(2);
@@ -725,7 +725,7 @@ TEST_CASE("What is damaged when a rank has given its part of a reduction counts 
             return;
         board->handlers.at(from)->receive(1 - from, board->pool->acquire(sizeof(MessageHeader) - 1));
         std::promise<void> noticed;
-        executor->submit([&] { noticed.set_value(); }); // after what that has submitted
+        executor->submit([&] { noticed.set_value(); }); // runs after the tasks submitted before
         noticed.get_future().wait();
     };
     std::vector<std::string> texts(2), after(2);
@@ -747,7 +747,7 @@ TEST_CASE("What is damaged when a rank has given its part of a reduction counts 
 
 TEST_CASE("A reduction that no rank can be at is malformed, and nobody waits for it", "[messaging]")
 {
-    // Of the constructor's reduction, which is number 0: its part becomes that of another.
+    // A message of the constructor's reduction, which is number 0, gets the number of another reduction.
     for (const std::int64_t number : {-1, 1, 1000000}) {
         const auto board = std::make_shared<Board>();
         std::atomic<bool> done{false};
@@ -775,7 +775,7 @@ TEST_CASE("A reduction's result is malformed where nothing was given to it", "[m
 
 namespace {
 
-// Rank 1 sends an input right behind its part of the constructor's reduction.
+// A transport in which rank 1 sends an input right after its part of the constructor's reduction.
 class Hasty : public Forward<dfb::InprocTransport> {
 public:
     using Communicator = dfb::InprocCommunicator;
@@ -784,7 +784,7 @@ public:
     void send(int to, dfb::Buffer&& message)
     {
         auto header = dfb::detail::loadAs<MessageHeader>(message.data());
-        if (hasSentBoth_) { // that input has had a number of its own
+        if (hasSentBoth_) { // that input had a sequence number of its own
             ++header.sequence;
             std::memcpy(message.data(), &header, sizeof header);
         }
@@ -829,14 +829,15 @@ TEST_CASE("What has come for a framebuffer that is refused is still in order whe
 
 TEST_CASE("A damaged message that comes before its frame has begun fails that frame on every rank", "[messaging]")
 {
-    // It comes when its receiver has left the frame before, or when that one has voted and waits for the verdict.
+    // The message comes when its receiver has left the frame before, or when it has voted there and waits for the
+    // verdict.
     for (const bool left : {true, false}) {
         const auto board = std::make_shared<Board>();
         std::promise<void> came, isOut;
         std::atomic<bool> done{false}, said{false};
         board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
             if (header.kind == MessageKind::Fragment && header.number == 2 && !done.exchange(true))
-                message.data()[0] ^= std::byte{1}; // no message of dfb any more
+                message.data()[0] ^= std::byte{1}; // this is no longer a message of dfb
             const bool isVerdict = header.kind == MessageKind::ReduceDown && header.number == 1
                                    && dfb::detail::loadAs<std::uint32_t>(message.data() + sizeof header) == 2;
             return isVerdict && !left ? Board::What::Hold : Board::What::Pass;
@@ -913,7 +914,7 @@ TEST_CASE("The image is right after frames that failed when most of their tiles 
             FrameBuffer<Blend> fb(communicator, config);
             for (int i = 0; i < 6; ++i) {
                 if (i % 2 == 1) {
-                    // Most tiles are finished, and in a message, when it fails.
+                    // When the frame fails, most tiles are finished and in a message.
                     const std::string text = outcomeOf([&] {
                         auto frame = fb.begin();
                         const auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
@@ -989,7 +990,7 @@ TEST_CASE("Finished tiles leave for the display rank while their owner still ren
 
 namespace {
 
-// Counts the inputs that it has been given, on all ranks.
+// An operation that counts its inputs, on all ranks together.
 std::atomic<int> inputsAdded{0};
 struct Counter : dfb::BasicAlphaBlend<16> {
     void add(dfb::Fragment&& fragment)
@@ -1021,7 +1022,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
                 {
                     auto frame = fb.begin(scene::paramsOf(s));
                     const auto tile = std::make_unique<FrameBuffer<Counter>::Tile>();
-                    if (fb.rank() == 1) { // once rank 0's begin(), which moves messages, is done
+                    if (fb.rank() == 1) { // after rank 0's begin(), which moves messages
                         begun.get_future().wait_for(std::chrono::seconds(20));
                         for (const dfb::Brick& brick : s.bricks)
                             for (int index = 0; index < 28; ++index) {
@@ -1067,7 +1068,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
 
 TEST_CASE("A thread that waits for room gives up only if nothing moves", "[messaging]")
 {
-    // Each credit of the receiver comes late, and some of 16 threads are always quicker than another.
+    // Each credit of the receiver comes late, and some of the 16 threads are always faster than others.
     struct Outcome {
         std::vector<std::string> texts{2};
         int credits = 0;
@@ -1106,7 +1107,7 @@ TEST_CASE("A thread that waits for room gives up only if nothing moves", "[messa
                     frame.setTile(tile);
                 });
                 sent = sent || fb.rank() == 1;
-                while (!sent && !frame.failed()) // from end() on the time runs whatever moves
+                while (!sent && !frame.failed()) // in end() the time-out runs even if messages move
                     std::this_thread::sleep_for(std::chrono::milliseconds(1));
                 frame.end();
             });
@@ -1123,8 +1124,8 @@ TEST_CASE("A thread that waits for room gives up only if nothing moves", "[messa
 
 TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[messaging]")
 {
-    // 64 tiles of 64 KiB, and a pool of four; the frame is cancelled when they are finished. `senders`: ranks whose
-    // inputs have asked for room before, and are forgotten then.
+    // 64 tiles of 64 KiB, and a pool of four. The frame is cancelled when the tiles are finished. `senders`: number of
+    // ranks whose inputs have asked for room before that, and are then dropped.
     constexpr int tiles = 64;
     const int senders = GENERATE(0, 22), inputs = 4;
     static std::atomic<int> finished{0};
@@ -1154,7 +1155,7 @@ TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[m
         Fb fb(communicator, config);
         const int rank = fb.rank();
         std::promise<void> mayReceive;
-        if (rank == 0 && senders > 0) // its worker, which hands out credit
+        if (rank == 0 && senders > 0) // its worker hands out credit
             fb.executor().submit([&] { mayReceive.get_future().wait(); });
         auto frame = fb.begin(params);
         auto tile = std::make_unique<Fb::Tile>();
@@ -1162,7 +1163,7 @@ TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[m
         waitFor([&] { return rank != 1 || set == senders; });
         for (int i = 0; i < (rank == 0 ? 0 : rank == 1 ? tiles : inputs); ++i) {
             frame.start(*tile, first + i);
-            for (std::size_t k = 0; k < 64 * 64; ++k) { // not what a few bytes could say
+            for (std::size_t k = 0; k < 64 * 64; ++k) { // not constant, so that all of it is sent
                 tile->color[4 * k] = static_cast<float>(k % 777) / 1000;
                 tile->color[4 * k + 1] = tile->color[4 * k + 3] = 0.5f;
                 tile->depth[k] = static_cast<float>(k);
@@ -1191,7 +1192,8 @@ TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[m
     CHECK(finished == tiles);
     REQUIRE(reports[0].failure);
     CHECK(reports[0].failure->kind == dfb::ErrorKind::Cancelled);
-    // One, and those of the senders, were never sent; another may not have been handed on when the frame was cancelled.
+    // One input, and those of `senders`, were never sent. One more may not have been passed on when the frame was
+    // cancelled.
     const int never = 1 + senders * inputs;
     CHECK(reports[0].tilesIncomplete >= never);
     CHECK(reports[0].tilesIncomplete <= never + 1);

@@ -1,4 +1,4 @@
-// Tile and pixel operations inside the framebuffer: those that come with it and those that a user writes.
+// Tile and pixel operations inside the framebuffer: those of the library and those of a user. Ranks are threads.
 #include "catch.hpp"
 #include "random_scene.hpp"
 
@@ -65,7 +65,7 @@ Picture pictureOf(const Scene& s, Loop loop, const PixelOp& op, dfb::OutputForma
     return result;
 }
 
-// The same computation as ToneMap's, on the float image of a frame without it: that is what a PixelOp is given.
+// Computes ToneMap on the float image of a frame without it, which is what a PixelOp gets.
 std::vector<float> toneMapped(const Picture& plain, float exposure)
 {
     std::vector<float> result(plain.bytes.size() / sizeof(float));
@@ -89,7 +89,8 @@ std::int64_t worstUlps(const Picture& picture, const std::vector<float>& expecte
     return worst;
 }
 
-// Sees whole tiles: not pointwise. Counts how often it saw each pixel, and marks the pixels.
+// A pixel operation that sees whole tiles, as it is not pointwise. It counts how often it sees each pixel, and marks
+// pixels.
 struct Watcher {
     struct Log {
         std::mutex mutex;
@@ -110,7 +111,7 @@ struct Watcher {
         for (int y = tile.region.y0; y < tile.region.y1; ++y)
             for (int x = tile.region.x0; x < tile.region.x1; ++x)
                 ++log->pixels.at(static_cast<std::size_t>(y * width + x));
-        // Not a function of the pixel alone: the tile's number.
+        // The tile's number, which is not a function of the pixel alone.
         for (std::size_t i = 0; mark && i < tile.pixelCount(); ++i)
             tile.color[4 * i] = static_cast<float>(tile.tile);
     }
@@ -127,8 +128,8 @@ Watcher makeWatcher(const Scene& s, bool withDepth, bool mark)
     return w;
 }
 
-// A tile operation of a user's: counts the inputs of each pixel, times a factor that comes with the frame; red. Green
-// is the rank that owns the tile, blue the frame, alpha what is given with the frame.
+// A user's tile operation. Red is the number of inputs of a pixel, times a factor in the frame data; green the rank
+// that owns the tile; blue the frame; alpha a value in the frame data.
 struct CountInputs {
     static constexpr int tileSize = 16;
     static constexpr dfb::ChannelMask channels = dfb::colorChannel;
@@ -175,7 +176,7 @@ private:
 };
 static_assert(dfb::is_tile_op_v<CountInputs>);
 
-// Has enough when the first input with pixels is there.
+// An operation that has enough after the first input with pixels.
 struct FirstOpaque : dfb::BasicAlphaBlend<16> {
     void newFrame(const dfb::TileInfo& info)
     {
@@ -212,7 +213,7 @@ TEST_CASE("ToneMap is Reinhard's operator on the composited float image", "[oper
                                   : pictureOf<dfb::BasicImageParallel<16>>(s, loop, dfb::NoPixelOp());
         const auto expected = toneMapped(plain, exposure);
         const Picture floats = mapped(dfb::OutputFormat::RGBA32F, true);
-        // ToneMap has 4 roundings in float, of half an ulp each, where the reference has one; none is amplified.
+        // ToneMap rounds 4 times in float, by half an ulp each, where the reference rounds once. No error is amplified.
         CHECK(worstUlps(floats, expected) <= 4);
         CHECK(floats.depth == plain.depth);
         // With a PixelOp the output is rounded from its float result.
@@ -238,7 +239,7 @@ TEST_CASE("ToneMap keeps emission and alpha", "[operations]")
     std::vector<float> pixels{0.5f, 0.25f, 0, 0.5f, /* emission */ 1.0f, 0, 0, 0, /* nothing */ 0, 0, 0, 0};
     dfb::PixelTile tile{0, {0, 0, 3, 1}, pixels.data(), nullptr};
     op.process(tile);
-    // c = 1, k c = 2: 2/3, times alpha; c = 0.5: 1/2; emission 1: 2/3.
+    // Colour 1, times exposure 2: 2/3, times alpha. Colour 0.5: 1/2. Emission 1: 2/3.
     CHECK(dfb::testing::ulpsBetween(pixels[0], 1.0f / 3) <= 4);
     CHECK(pixels[1] == 0.25f);
     CHECK(pixels[3] == 0.5f);
@@ -262,7 +263,7 @@ TEST_CASE("PixelOpChain runs the first, then the second, each with its data", "[
     CHECK(both.hash() != once.hash());
     CHECK(once.hash() != plain.hash());
 
-    // A chain with a member that is not pointwise is not: it sees all tiles, after the first.
+    // A chain with a member that is not pointwise is not pointwise: that member sees all tiles, after the first member.
     const Watcher watcher = makeWatcher(s, true, false);
     using Watched = dfb::PixelOpChain<dfb::ToneMap, Watcher>;
     Watched::FrameData watchedData;
@@ -327,7 +328,7 @@ TEST_CASE("A tile operation of a user's, with data for the frame", "[operations]
             auto open = fb.begin(params, data);
             std::vector<dfb::TileInput> inputs;
             const auto mine = scene::bricksOf(s, fb.rank(), fb.size());
-            // Every tile gets every brick: most are "nothing here".
+            // Every tile gets every brick, so most inputs are empty.
             for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
                 for (const dfb::Brick& brick : mine)
                     inputs.push_back({tile, brick.id, 0});
@@ -375,7 +376,7 @@ TEST_CASE("A tile operation of a user's, with data for the frame", "[operations]
 
 TEST_CASE("A tile operation that has enough ends its tile early", "[operations]")
 {
-    // Each tile gets an opaque input, and waits besides for one that never comes.
+    // Each tile gets an opaque input and also waits for one that never comes.
     Scene s = scene::makeScene(1, 16);
     std::vector<std::int64_t> late(2, -1);
     std::vector<std::size_t> wrong(2, 1);
@@ -433,7 +434,7 @@ TEST_CASE("A renderer that flushes denormals on its threads does not change the 
 {
     Scene s = scene::makeScene(0);
     s.background = {0, 0, 0, 0};
-    // A denormal, and 2^-31, which is one as it travels.
+    // A denormal, and 2^-31, which is a denormal in half precision.
     for (const auto& [wire, value] :
          {std::make_pair(dfb::WireFormat::Float32, 1000u), std::make_pair(dfb::WireFormat::Float16, 0x30000000u)}) {
         Picture p;
@@ -445,7 +446,7 @@ TEST_CASE("A renderer that flushes denormals on its threads does not change the 
             const dfb::World world(fb.rank() == 1 ? bricks : std::vector<dfb::Brick>());
             const auto report =
                 dfb::DataParallelLoop(fb, world).render(scene::FlatCamera(), [&](const dfb::Brick&, auto& tile) {
-                    flushDenormals(); // and never undone
+                    flushDenormals(); // and does not undo it
                     for (int i = 0; i < 4 * 16 * 16; ++i)
                         std::memcpy(tile.color + i, &value, sizeof value);
                 });

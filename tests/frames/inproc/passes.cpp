@@ -1,4 +1,5 @@
-// How often a pixel is copied on its way: out of the renderer's image into its message, and out of that into the image.
+// How often a pixel is copied: once from the renderer's image into a message, and once from there into the image. 3
+// ranks, which are threads.
 #include "board.hpp"
 #include "catch.hpp"
 #include "random_scene.hpp"
@@ -22,16 +23,16 @@ using board::BoardTransport;
 
 constexpr int ranks = 3;
 
-// Where pixels lie in memory.
+// The addresses of pixels in memory.
 struct Places {
     std::mutex mutex;
-    std::vector<std::pair<const std::byte*, std::size_t>> messages; // that were sent; under mutex, as is the rest
-    std::vector<const std::byte*> inputs;                           // that operations have got
+    std::vector<std::pair<const std::byte*, std::size_t>> messages; // messages sent; under mutex, as are the next two
+    std::vector<const std::byte*> inputs;                           // inputs that operations got
     std::vector<std::tuple<int, const std::byte*>> finished;        // tile, first row
 };
 Places* places = nullptr;
 
-// Takes note of the addresses.
+// An operation that notes the addresses of its inputs and outputs.
 template <class Base>
 class Watched : public Base {
 public:
@@ -100,8 +101,8 @@ void check()
                     row == image + static_cast<std::size_t>(r.y0) * bytesPerRow + 16 * static_cast<std::size_t>(r.x0);
             }
     });
-    // Each input is read where it lies in the message that its sender has written; those of a rank to itself, too, but
-    // that one is not seen here.
+    // Each input is read in the message that its sender has written. This also holds for inputs of a rank to itself,
+    // but the board does not see those messages.
     std::size_t inMessages = 0;
     for (const std::byte* input : seen.inputs)
         inMessages += std::any_of(seen.messages.begin(), seen.messages.end(),
@@ -109,7 +110,7 @@ void check()
     CHECK(seen.inputs.size() > 20);
     CHECK(own < seen.inputs.size());
     CHECK(inMessages >= seen.inputs.size() - own);
-    // What the display rank finishes itself is written where it belongs.
+    // Tiles that the display rank finishes itself are written directly into the image.
     CHECK(displayed > 3);
     CHECK(finishedInImage == displayed);
 }

@@ -1,5 +1,6 @@
-// Frames that are right, on ranks and networks that are slow at random, while ranks look all the time whether anything
-// is still under way: none may be taken for one that misses an input. And some that do miss one are.
+// Good frames on ranks and networks that are slow at random, while ranks check all the time whether anything is still
+// under way. None of them may be taken for a frame that misses an input; frames that do miss one must be found. Ranks
+// are threads.
 #include "catch.hpp"
 #include "random_scene.hpp"
 
@@ -27,7 +28,7 @@ namespace {
 
 using Transport = dfb::testing::FaultTransport<dfb::InprocTransport>;
 
-// Now and then it takes some ms to finish a tile.
+// An operation that now and then takes some ms to finish a tile.
 std::atomic<std::uint64_t> tilesFinished{0};
 class SlowBlend : public dfb::BasicAlphaBlend<16> {
 public:
@@ -41,12 +42,12 @@ public:
 using FrameBuffer = dfb::DistributedFrameBuffer<SlowBlend, dfb::NoPixelOp, Transport>;
 
 struct Outcome {
-    int frames = 0, found = 0; // right; that miss an input and were found
+    int frames = 0, found = 0; // good frames; frames that miss an input and were found
     std::string wrong;
-    std::int64_t looks = 0; // messages of rounds
+    std::int64_t looks = 0; // messages of the rounds in which ranks check
 };
 
-// Frames on so many ranks; whatever is random is the same on all of them, but for what they wait.
+// Renders frames on `ranks` ranks. Random choices are the same on all ranks, but for the times that each waits.
 Outcome frames(std::uint64_t seed, int ranks, int threads, int inFlight, int count)
 {
     Outcome outcome;
@@ -168,7 +169,7 @@ void stress(int count, std::uint64_t seeds)
     }
     INFO(all.frames << " frames, " << all.found << " that missed an input, " << all.looks << " messages of rounds");
     CHECK(all.found > 0);
-    CHECK(all.looks > all.frames / 10); // or it is not tried hard enough
+    CHECK(all.looks > all.frames / 10); // otherwise the ranks check too seldom for this test
 }
 
 } // namespace

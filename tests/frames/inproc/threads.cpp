@@ -1,4 +1,5 @@
-// Threads of default executors: ranks that are threads of one process share the processors that it may run on.
+// The number of threads of default executors: ranks that are threads of one process share the processors that it may
+// use.
 #include "catch.hpp"
 
 #include <dfb/dfb.hpp>

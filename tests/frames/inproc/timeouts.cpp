@@ -1,5 +1,6 @@
-// Frames with a time-out: what is missing fails them with an error that says so, the same on every rank; what cannot
-// even be agreed on is a TransportError. Ranks are threads; every test has a time limit.
+// Frames with a time-out. If an input or message is missing, the frame fails with an error that names it and is the
+// same on every rank. If ranks cannot even agree on the error, they get a TransportError. Ranks are threads; every test
+// has a time limit.
 #include "board.hpp"
 #include "catch.hpp"
 #include "random_scene.hpp"
@@ -48,7 +49,7 @@ bool allSame(const std::vector<std::string>& texts)
     return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
 }
 
-// What a rank got out of a frame: its error, or none.
+// The outcome of a frame on a rank: its error, or none.
 struct Ending {
     std::optional<dfb::ErrorInfo> error;
     bool isFrameError = false;
@@ -84,7 +85,7 @@ std::vector<std::string> textsOf(const std::vector<Ending>& endings)
     return texts;
 }
 
-// One bad frame, then a good one without time-out. `frame(fb)` runs the bad one up to end().
+// A bad frame, then a good one without time-out. `frame(fb)` runs the bad frame up to end().
 struct Run {
     std::vector<Ending> endings;
     std::size_t wrongAfter = 1;
@@ -112,7 +113,7 @@ Run run(const std::shared_ptr<Board>& board, int ranks, dfb::FrameBufferConfig c
     return result;
 }
 
-// The same for a case that is not one of eachAtOnce().
+// Like run(), for a case that is not run by eachAtOnce().
 template <class... Args>
 Run runAlone(const Args&... args)
 {
@@ -128,7 +129,7 @@ void send(FrameBuffer::Frame& frame, int index, int generation, std::uint32_t so
     tile->source = source;
     tile->part = part;
     tile->children = children;
-    tile->pixel(0, 0)[3] = 0.5f; // tiles without anything do not travel to the display rank
+    tile->pixel(0, 0)[3] = 0.5f; // empty tiles do not travel to the display rank
     frame.setTile(*tile);
 }
 
@@ -137,10 +138,10 @@ dfb::FrameBufferConfig smallConfig() // 28 tiles
     return configOf(scene::makeScene(0));
 }
 
-// Long enough for all that is not held back to happen on a machine that is busy with other things: a frame that has
-// failed has as long again to come to its verdict. Cases that wait for it run at once.
+// Long enough, even on a busy machine, for everything that is not held back. A frame that has failed has as much time
+// again to reach its verdict. Cases that wait for it run at the same time.
 constexpr int limitMs = 1000;
-// How long after that many milliseconds an error may come, on a machine that is busy with other things.
+// How many ms later than that an error may come on a busy machine.
 constexpr double marginMs = 5000;
 
 dfb::FrameConfig timed(bool declared, int timeoutMs = limitMs)
@@ -221,7 +222,7 @@ TEST_CASE("A time-out that is not reached changes nothing", "[timeouts]")
 
 TEST_CASE("An announced input that is never sent is named on every rank", "[timeouts]")
 {
-    // Tile 5 of owner 1 waits for 3 inputs of generation 1, and gets 2.
+    // Tile 5, owned by rank 1, waits for 3 inputs of generation 1 and gets 2.
     struct Case {
         int ranks;
         bool shuffle;
@@ -269,7 +270,7 @@ TEST_CASE("An announced input that is never sent is named on every rank", "[time
                 CHECK(e.ms < 2 * limitMs + marginMs);
                 soonest = std::min(soonest, e.ms);
             }
-            // Who ends the frame first waits for the time-out, not less.
+            // The rank that ends the frame first waits for the whole time-out.
             CHECK(std::any_of(endings.begin(), endings.end(), [](const Ending& e) { return e.ms >= limitMs; }));
         });
     CHECK(soonest < 2 * limitMs); // the machine is not always late
@@ -346,8 +347,8 @@ TEST_CASE("A declared input that is never sent is named with its source, part an
 
 TEST_CASE("What several owners miss is all listed, whoever's time was up first", "[timeouts]")
 {
-    // Tile t is owned by rank t: those in `missing` do not get theirs. Rank `first` ends the frame alone; the others
-    // when they know that it has failed.
+    // Rank t owns tile t. The tiles in `missing` do not get their inputs. Rank `first` calls end() first; the others
+    // call it when they know that the frame has failed.
     struct Case {
         int ranks;
         std::vector<int> missing;
@@ -405,7 +406,7 @@ TEST_CASE("What fails a frame is said even if something is missing as well", "[t
             const auto limit = Clock::now() + std::chrono::seconds(20);
             if (fb.rank() != culprit)
                 return;
-            while (!frame.failed() && Clock::now() < limit) // the others' time is up
+            while (!frame.failed() && Clock::now() < limit) // until the time-out of the others
                 std::this_thread::sleep_for(std::chrono::milliseconds(1));
             frame.abort(std::make_exception_ptr(std::runtime_error("out of paint")));
         });
@@ -571,7 +572,8 @@ TEST_CASE("One lost message of each kind: an error in time, on every rank", "[ti
                 frame.declare(inputs);
                 for (const dfb::TileInput& input : inputs)
                     send(frame, input.tile, 1, input.source, 0, 0);
-                // The time is for the message that is lost, not for what leads to it: all but votes are sent before.
+                // The time-out is for the lost message, not for the steps before it: all messages but votes are sent
+                // before end().
                 ++ready;
                 const auto limit = Clock::now() + std::chrono::seconds(20);
                 while ((ready < c.ranks || (!lost && c.loss.scope != FrameVerdict)) && Clock::now() < limit)
@@ -603,7 +605,7 @@ TEST_CASE("One lost message of each kind: an error in time, on every rank", "[ti
                 CHECK((e.error && e.error->kind == dfb::ErrorKind::TimedOut));
                 CHECK(o.after[rank] == "fine");
             } else {
-                // Who has the verdict is fine, who has not can only give up; then nobody can go on.
+                // A rank that has the verdict is fine; a rank without it can only give up. Then no rank can go on.
                 CHECK((e.text == "fine" || (e.error && e.error->kind == dfb::ErrorKind::Transport)));
                 CHECK(has(o.after[rank], "TransportError"));
             }
@@ -619,8 +621,8 @@ TEST_CASE("Lost credit, or requests for it: setTile() does not wait for ever, an
 {
     using Large = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, BoardTransport>;
     for (const auto kind : {MessageKind::Credit, MessageKind::CreditRequest}) {
-        // All of a kind that rank 1 gets or sends: of credit the next would make good for one that is lost. With 9
-        // ranks a sender's own part of the pool is less than a message.
+        // All messages of this kind that rank 1 gets or sends are lost, as the next credit would replace a lost one.
+        // With 9 ranks a sender's own part of the pool is less than a message.
         const int ranks = kind == MessageKind::Credit ? 2 : 9;
         struct Outcome {
             std::vector<Ending> endings;

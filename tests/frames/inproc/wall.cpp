@@ -1,4 +1,4 @@
-// DisplayWall: what travels to whom.
+// DisplayWall: which pixels travel to which rank. 4 ranks, which are threads.
 #include "board.hpp"
 #include "catch.hpp"
 
@@ -34,7 +34,7 @@ TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
         });
         wall.finish(report.frame);
     });
-    // Each rank owns 4 of 16 tiles of 4 KiB, and gets of the 4 on its display those that others own; no more.
+    // Each rank owns 4 of 16 tiles of 4 KiB. It receives at most the 4 tiles of its display, if others own them.
     REQUIRE(pixelBytes.size() == 4);
     for (const auto& [rank, bytes] : pixelBytes) {
         INFO("rank " << rank);

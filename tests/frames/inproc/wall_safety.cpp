@@ -1,5 +1,5 @@
-// Display walls and messages that are lost, come twice or say what cannot be: an error that says so, on every rank,
-// and none waits for ever; never a display that is wrong without a word.
+// Display walls, and messages that are lost, repeated or invalid: every rank gets an error that says so, none waits for
+// ever, and no display is wrong without an error. Ranks are threads.
 #include "board.hpp"
 #include "catch.hpp"
 #include "random_scene.hpp"
@@ -45,8 +45,8 @@ struct Outcome {
     std::size_t wrong = 0;                                  // pixels on the displays after frames that were fine
 };
 
-// Two frames on a wall of two displays, one of each of 2 ranks. `change` gets the first message of this kind from rank
-// 1 to the wall of rank 0, and says what becomes of it. `timeoutMs`: of finish().
+// Renders two frames on a wall of two displays, one on each of 2 ranks. `change` gets the first message of this kind
+// from rank 1 to the wall of rank 0, and decides what happens to it. `timeoutMs` is for finish().
 Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Buffer&)>& change)
 {
     Outcome result;
@@ -77,7 +77,7 @@ Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Bu
             config.executor = executor;
             FrameBuffer fb(connection, config, {&wall});
             const auto rank = static_cast<std::size_t>(fb.rank());
-            armed = true; // rank 1 has sent what the constructors send to the wall
+            armed = true; // rank 1's constructors have sent their messages
             const auto frame = [&](float shade) {
                 dfb::FrameConfig params;
                 params.background = {shade, shade, shade, 1};
@@ -120,7 +120,7 @@ TEST_CASE("A part of a display that cannot be fails its frame on every rank, and
     const auto moved = [](int x, int y) {
         return [=](dfb::Buffer& m) {
             auto r = dfb::detail::loadAs<dfb::Region>(m.data() + region);
-            // To where another part is, of the same size.
+            // Moves it to the place of another part of the same size.
             r.x0 += r.x0 < 32 ? x : -x, r.x1 = r.x0 + 16;
             r.y0 += r.y0 < 32 ? y : -y, r.y1 = r.y0 + 16;
             put(m, region, r);
@@ -205,7 +205,7 @@ TEST_CASE("The longest of all times is none that a wall's end of frame exceeds",
     std::vector<std::string> texts(2);
     board::runOn(std::make_shared<Board>(), 2, [&](const BoardTransport::Communicator& communicator) {
         const auto connection = dfb::connect<BoardTransport>(communicator);
-        // Its work is done in finish(): so that has to wait.
+        // With a CallerExecutor the wall's work is done in finish(), which therefore has to wait.
         dfb::DisplayWall wall(connection, {2, 1, 64, 64, 0, 0, {0, 1}}, dfb::OutputFormat::RGBA8,
                               std::make_shared<dfb::CallerExecutor>());
         FrameBuffer fb(connection, wall.frameBufferConfig(), {&wall});

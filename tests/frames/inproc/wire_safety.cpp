@@ -1,5 +1,5 @@
-// Ranks that were built differently, and messages that say what cannot be: an error that says so, on every rank, and
-// none waits for ever. (That no bytes at all do harm is what tests/fuzz looks at.)
+// Ranks that were built differently, and invalid messages: every rank gets an error that says so, and none waits for
+// ever. (tests/fuzz checks that arbitrary bytes do no harm.) Ranks are threads.
 #include "board.hpp"
 #include "catch.hpp"
 #include "random_scene.hpp"
@@ -56,7 +56,7 @@ bool allSame(const std::vector<std::string>& texts)
     return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
 }
 
-// What each of 4 ranks got out of making a framebuffer, rank 3 with another operation than the others.
+// The errors of 4 ranks that make a framebuffer, rank 3 with another operation than the others.
 template <class Odd>
 std::vector<std::string> madeWith()
 {
@@ -146,7 +146,7 @@ TEST_CASE("A rank of another version or byte order is found when framebuffers ar
         for (int odd = 0; odd < 4; ++odd) {
             const auto watched = std::make_shared<Board>();
             watched->inspect = [&](int from, int to, const MessageHeader& header, dfb::Buffer& message) {
-                // As either side sees the other.
+                // Changes the messages so that each side sees the other as different.
                 if (byteOrder && (from == odd || to == odd))
                     put(message, 0, MessageHeader::magicSwapped);
                 else if (from == odd || to == odd)
@@ -170,8 +170,8 @@ TEST_CASE("A rank of another version or byte order is found when framebuffers ar
 
 namespace {
 
-// How a frame of 3 ranks ended, and whether the next one was right, when the first message of its kind (and scope, of a
-// reduction) from a rank was changed.
+// The outcome of a frame of 3 ranks, and of the next one. In the first frame, the first message of a kind (and scope,
+// if it belongs to a reduction) from one rank was changed.
 struct Changed {
     bool done = false;
     std::vector<std::string> texts, after;
@@ -238,7 +238,7 @@ TEST_CASE("A message that says what cannot be fails its frame on every rank, and
     std::int32_t owned = 0; // by rank 1
     for (int tile = 0; tile < layout.tileCount(); ++tile)
         owned += dfb::latticeOwner(tile, layout, 3) == 1;
-    // What a rank says of its finished tiles: how many there are, and in how many messages.
+    // Changes what a rank says of its finished tiles: how many there are, and in how many messages.
     const auto oneLess = [](dfb::Buffer& m) { put(m, body, dfb::detail::loadAs<std::int32_t>(m.data() + body) - 1); };
     const auto oneMessageLess = [](dfb::Buffer& m) {
         put(m, body + 4, dfb::detail::loadAs<std::int32_t>(m.data() + body + 4) - 1);
@@ -325,7 +325,7 @@ TEST_CASE("A vote or a verdict that is none ends the connection, as there is no 
         INFO(lie.name << joined(c.texts) << "\n after it" << joined(c.after));
         CHECK(c.done);
         CHECK(c.wrong == 0);
-        // Who has had the verdict already knows in the next frame.
+        // A rank that already has the verdict gets the error in the next frame.
         for (std::size_t rank = 0; rank < 3; ++rank) {
             CHECK((has(c.texts[rank], "TransportError")
                    || (lie.kind == MessageKind::ReduceDown && c.texts[rank] == "fine")));
@@ -336,7 +336,7 @@ TEST_CASE("A vote or a verdict that is none ends the connection, as there is no 
 
 namespace {
 
-// Where a rank's own part of a call begins: behind the scope, the lowest rank, and the call's name.
+// The offset of a rank's own part in the message of a call: behind the scope, the lowest rank, and the call's name.
 constexpr std::size_t ownPart(std::string_view call) { return body + 4 + 4 + sizeof(std::uint32_t) + call.size(); }
 
 } // namespace
