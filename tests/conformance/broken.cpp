@@ -1,5 +1,5 @@
-// A suite that passes everything is worth nothing: transports that break the contract, each in one way, and what
-// checkTransport() is to say of them.
+// The conformance suite must find faults: transports that break the contract, each in one way, and the failure that
+// checkTransport() must report for each. 2 ranks, which are threads; all cases have short time limits.
 #include "catch.hpp"
 #include "shuffled.hpp"
 
@@ -39,15 +39,15 @@ enum class Defect {
     DeliversTwice,
     NamesTheWrongSource,
     LosesWhatComesBeforeStart,
-    MixesTransports, // of those on a rank the one that was started last gets some messages of the others
+    MixesTransports, // messages of the other transports of a rank go to the one started last
     BlocksInSend,
-    BlocksInInterrupt, // of a handler
+    BlocksInInterrupt, // called by a handler
     WaitsInAbandon,
     CallsAfterStop,
     Oversleeps,
     HardlySleeps,
     IsNotInterrupted,
-    ForgetsAnEarlyInterrupt, // ends the nap under way, and no other
+    ForgetsAnEarlyInterrupt, // ends a nap under way, but not the next one
     SleepsOverSendsAndArrivals,
     ClaimsToNeedNoPolls,
     AlwaysSaysThatItMoved,
@@ -59,13 +59,13 @@ enum class Defect {
 
 std::atomic<bool> testIsOver{false};
 
-// The handlers of the transports on each of the two ranks of a run, in the order of their start.
+// The handlers of the transports on each of the two ranks of a run, in the order in which they were started.
 struct Started {
     std::mutex mutex;
     std::array<std::vector<TransportHandler*>, 2> handlers;
 };
 
-// One type for all, as each takes a while to compile with the suite.
+// One class has all defects, as each instantiation of the suite takes a while to compile.
 class Broken : private TransportHandler {
 public:
     using Base = testing::FaultTransport<ShuffledTransport>;
@@ -202,13 +202,13 @@ private:
     std::thread late_;
 };
 
-// What to put the transport over: one that delivers at once, one that holds messages back at the sender, or one that
-// holds them back at the receiver.
+// The transport under the broken one: one that delivers at once, one that holds messages back at the sender, or one
+// that holds them back at the receiver.
 enum class Over { Plain, Late, Shuffled };
 
 struct Case {
     Defect defect;
-    // What must be found: a line that begins with `name` and has `what` in it.
+    // The failure that must be found: a line that begins with `name` and contains `what`.
     std::string name, what;
     Over over = Over::Plain;
     Progress mode = Progress::Caller;
@@ -236,7 +236,7 @@ std::string failuresOf(const Case& c)
     return text;
 }
 
-// `text` has a line for `name` that says `what`.
+// Whether `text` has a line that begins with `name` and contains `what`.
 bool finds(const std::string& text, const std::string& name, const std::string& what)
 {
     for (std::size_t from = 0, to = 0; from < text.size(); from = to + 1) {
@@ -248,7 +248,7 @@ bool finds(const std::string& text, const std::string& name, const std::string& 
     return false;
 }
 
-// All at the same time, as they mostly wait.
+// Runs all cases at the same time, as they mostly wait.
 void checkFound(const std::vector<Case>& cases)
 {
     std::vector<std::future<std::string>> runs;

@@ -1,4 +1,4 @@
-// What FaultTransport does, and that it does what it counts.
+// FaultTransport: its faults follow from the seed, and its counts are right. Ranks are threads.
 #include "catch.hpp"
 
 #include <dfb/comm/inproc_transport.hpp>
@@ -37,7 +37,7 @@ bool same(const FaultDecision& a, const FaultDecision& b)
                        b.random);
 }
 
-// Messages in the order in which they came.
+// Keeps messages in the order in which they arrive.
 struct Inbox final : TransportHandler {
     std::mutex mutex;
     std::vector<std::string> messages;
@@ -51,7 +51,7 @@ struct Inbox final : TransportHandler {
     bool failed() const override { return false; }
 };
 
-// What rank 1 gets when rank 0 sends it the numbers 0 to count-1, each as a text of 24 bytes.
+// The messages that rank 1 gets if rank 0 sends the numbers 0 to count-1, each as a text of 24 bytes.
 struct Run {
     std::vector<std::string> received;
     std::shared_ptr<testing::FaultCounts> counts = std::make_shared<testing::FaultCounts>();
@@ -166,7 +166,7 @@ TEST_CASE("A decision follows from seed, rank, destination and number alone")
         compare("swapped", testing::decideFault(faults, 3, 2, number));
         compare("number", testing::decideFault(faults, 2, 3, number + 1));
 
-        // Another probability leaves the other faults where they are.
+        // Changing one probability does not change the other faults.
         other = faults;
         other.reorder = 0;
         FaultDecision without = testing::decideFault(other, 2, 3, number);
@@ -242,7 +242,7 @@ TEST_CASE("The same seed does the same, whatever threads do")
     other.seed = 8;
     CHECK(sorted(run(other, 2000).received) != sorted(first.received));
 
-    const Run threads = run(someOfAll(), 2000, 4); // other messages have these numbers, as many of each kind
+    const Run threads = run(someOfAll(), 2000, 4); // other messages have the same numbers; the counts are equal
     CHECK(threads.received.size() == first.received.size());
     CHECK(threads.counts->reordered == first.counts->reordered);
     CHECK(threads.counts->delayed == first.counts->delayed);
@@ -331,7 +331,7 @@ TEST_CASE("A nap is not longer than what is held")
         const auto pool = MemoryPool::create();
         Faulty transport({communicator, faults}, pool, Progress::Caller);
         transport.start(inbox);
-        transport.send(0, pool->acquire(1)); // to itself, since nobody else is there
+        transport.send(0, pool->acquire(1)); // to itself, as there is no other rank
         const auto before = std::chrono::steady_clock::now();
         while (!transport.quiet()) {
             transport.nap(std::chrono::seconds(10));
@@ -346,7 +346,7 @@ TEST_CASE("A nap is not longer than what is held")
 
 namespace {
 
-// One that can do what transports need not: end the job, and let others see its memory.
+// A transport with both optional abilities: to end the job, and to let other ranks see its memory.
 struct Able : InprocTransport {
     struct Communicator {
         InprocCommunicator inner;

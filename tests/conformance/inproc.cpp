@@ -22,7 +22,7 @@ using Faulty = testing::FaultTransport<ShuffledTransport>;
 
 namespace {
 
-// The failures of all ranks.
+// Returns the failures of all ranks.
 template <class Transport, class Make>
 std::string check(int ranks, const ConformanceOptions& options, const Make& communicatorOf)
 {
@@ -58,18 +58,18 @@ ConformanceOptions quick(std::uint64_t seed = 1)
     return options;
 }
 
-// For what is meant to fail.
+// For cases that must fail.
 ConformanceOptions impatient()
 {
     ConformanceOptions options = quick();
-    options.timeLimit = std::chrono::milliseconds(2000); // for all but what is lost, on a busy machine
+    options.timeLimit = std::chrono::milliseconds(2000); // enough for all but lost messages, even if busy
     options.modes = {Progress::Caller};
     return options;
 }
 
 bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
-// Every rank says that something has failed.
+// Whether every rank reports a failure.
 bool failedOnAll(const std::string& text, int ranks)
 {
     for (int rank = 0; rank < ranks; ++rank)

@@ -38,7 +38,7 @@ std::string check(const typename Transport::Communicator& communicator, const Co
     return testing::describeFailures(testing::checkTransport<Transport>(communicator, options));
 }
 
-// All messages go through MPI.
+// A transport that sends all messages through MPI.
 struct Unshared : MpiTransport {
     Unshared(const Communicator& communicator, std::shared_ptr<MemoryPool>, Progress progress)
         : MpiTransport(communicator, MemoryPool::create(false), progress)
@@ -61,7 +61,7 @@ TEST_CASE("MpiTransport keeps the contract")
 {
     ConformanceOptions options;
     options.timeLimit = std::chrono::seconds(60);
-    if (rankCount() > 3) // for the time it takes
+    if (rankCount() > 3) // to save time
         options.largestMessage = std::size_t{1} << 22;
     CHECK(check<MpiTransport>(MPI_COMM_WORLD, options) == "");
     CHECK(check<Unshared>(MPI_COMM_WORLD, options) == "");
@@ -101,7 +101,7 @@ TEST_CASE("On one node blocks are lent, unless the pool may not be shared")
         CHECK_FALSE(inbox.isFailed);
         CHECK(inbox.messages.size() == (size > 1 ? 3u : 0u));
         for (std::size_t i = 0; i < inbox.messages.size(); ++i) {
-            const Buffer& message = inbox.messages[i]; // of any of the 3: order is not promised
+            const Buffer& message = inbox.messages[i]; // any of the 3, as order is not promised
             CHECK(inbox.sources[i] == (rank + size - 1) % size);
             REQUIRE(message.size() == byteCount);
             CHECK(std::to_integer<int>(message.data()[0]) / 10 == inbox.sources[i]);
@@ -134,7 +134,7 @@ TEST_CASE("A lost message is found on all ranks, and named")
     faults.maxLethal = 1;
     faults.only = [](int destination, const Buffer& message) { return destination == 1 && message.size() == 65536; };
     ConformanceOptions options = quick();
-    options.timeLimit = std::chrono::milliseconds(2100); // beside other tests a rank gets no processor for a while
+    options.timeLimit = std::chrono::milliseconds(2100); // short, but enough for a busy machine
     options.modes = {Progress::Caller};
     const std::string text = check<Faulty>({MPI_COMM_WORLD, faults}, options);
     INFO(text);
@@ -165,7 +165,7 @@ TEST_CASE("A rank that was built with another packet format is named on all rank
     for (const int odd : {0, size - 1}) {
         std::string text;
         if (rank == odd) {
-            // What any version does first, see mpi_ranks.hpp.
+            // The calls that any version makes first, see mpi_ranks.hpp.
             const std::uint64_t format = 12345;
             std::vector<std::uint64_t> all(static_cast<std::size_t>(size));
             MPI_Comm own = MPI_COMM_NULL;

@@ -1,8 +1,8 @@
-// The control messages' bodies, and who counts them: verdicts, agreements, errors, manifests, reductions, credit, jobs,
-// running numbers and headers. What is read is written the same again; what lies is refused, and never gets more than
-// there is.
+// The bodies of control messages, and the classes that count them: verdicts, agreements, errors, manifests, reductions,
+// credit, jobs, sequence numbers and headers. A body that was read is written the same again; an invalid one is
+// refused; no rank gets more credit or jobs than there are.
 //
-// An input: a byte that picks which, then its bytes.
+// An input: a byte that picks the kind, then its bytes.
 #include "fuzz.hpp"
 
 #include <dfb/comm/connection.hpp>
@@ -27,7 +27,7 @@ enum Which : std::uint8_t { Verdict, Agreement, Manifest, Reduction, Lender, Bor
 
 Bytes bytesFrom(const std::string& text) { return {fuzz::bytesOf(text), fuzz::bytesOf(text) + text.size()}; }
 
-// True if `call` was refused.
+// Returns whether `call` was refused.
 template <class Call>
 bool refused(const Call& call)
 {
@@ -40,7 +40,7 @@ bool refused(const Call& call)
     }
 }
 
-// Two of something: in front of them, how many bytes the first has.
+// Splits an input into two parts. In front of them is the length of the first.
 std::pair<Bytes, Bytes> two(fuzz::Input in)
 {
     const Bytes first = bytesFrom(in.text(in.take<std::uint16_t>() % 4096));
@@ -49,7 +49,7 @@ std::pair<Bytes, Bytes> two(fuzz::Input in)
 
 bool isSame(const Bytes& a, const Bytes& b) { return std::equal(a.begin(), a.end(), b.begin(), b.end()); }
 
-// Returns whether they are two.
+// Returns whether both parts are verdicts.
 bool verdicts(const fuzz::Input& in)
 {
     const auto parts = two(in);
@@ -76,7 +76,7 @@ bool verdicts(const fuzz::Input& in)
     return both;
 }
 
-// Returns whether they are two.
+// Returns whether both parts are agreements.
 bool agreements(const fuzz::Input& in)
 {
     const auto parts = two(in);
@@ -111,7 +111,7 @@ void manifests(const std::string& bytes)
     fuzz::require(refused([&] { exchange.receive(1, d::ByteReader(nullptr, 0), isMine); }), "none comes later");
 }
 
-// A rank within a tree of 5, which others send it parts and results for.
+// A rank in a tree of 5. The others send it parts and results in any order.
 void reductions(fuzz::Input in)
 {
     const int rank = in.take<std::uint8_t>() % 5, parent = rank & (rank - 1);
@@ -141,7 +141,7 @@ void reductions(fuzz::Input in)
         switch (what % 4) {
         case 0:
             if (m.entered || m.over)
-                break; // once is what its contract says
+                break; // its contract allows only one call
             m.entered = true;
             table.enter(
                 key, one,
@@ -177,11 +177,11 @@ void reductions(fuzz::Input in)
         if (rank != 0)
             fuzz::require(up[number] == (hasAll() ? 1 : 0), "the sum goes up when all is there");
         if (m.over)
-            return; // what comes now is of another reduction
+            return; // a later part belongs to another reduction
     }
 }
 
-// A receiver of three senders that ask for whatever they like, but send only what they were granted.
+// A receiver with three senders, which ask for any number of bytes, but send only what they were granted.
 void lender(fuzz::Input in)
 {
     constexpr std::uint64_t pool = 600, allowance = pool / 2 / 3;
@@ -216,7 +216,7 @@ void lender(fuzz::Input in)
     fuzz::require(flow.peakInboxBytes() <= pool, "the inbox is no more than the pool");
 }
 
-// A sender whose receivers grant whatever they like.
+// A sender whose receivers grant any number of bytes.
 void borrower(fuzz::Input in)
 {
     constexpr std::uint64_t pool = 600;

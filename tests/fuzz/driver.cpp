@@ -1,11 +1,11 @@
-// A driver for the fuzz targets where there is no libFuzzer:
+// Runs a fuzz target without libFuzzer:
 //
 //   test_fuzz_TARGET FILE_OR_FOLDER... [--mutations N] [--seed S]
-//       runs these inputs, and N inputs made of them, the same ones for the same S
+//       runs these inputs, and N mutations of them, which are the same for the same S
 //   test_fuzz_TARGET --write-seeds FOLDER
-//       writes the target's own seeds
+//       writes the seeds of the target
 //
-// The input that a run ends with is left in crash-input.
+// If a run crashes, its input is left in crash-input.
 #include "fuzz.hpp"
 
 #include <csignal>
@@ -70,7 +70,7 @@ void run(const std::string& input)
 
 std::size_t below(Random& random, std::size_t count) { return count == 0 ? 0 : random() % count; }
 
-// Numbers at which sizes and signs go wrong, little-endian.
+// Little-endian numbers that often reveal errors of sizes and signs.
 std::string oddNumber(Random& random)
 {
     static const std::uint64_t odd[] = {0,
@@ -101,7 +101,7 @@ std::string oddNumber(Random& random)
 void mutate(std::string& input, const std::vector<std::string>& corpus, Random& random)
 {
     for (std::size_t steps = 1 + below(random, 4); steps > 0; --steps) {
-        // Sizes and kinds stand in front.
+        // Mutates mostly the front, as sizes and kinds are there.
         const std::size_t reach = below(random, 2) ? input.size() : std::min<std::size_t>(input.size(), 80);
         const std::size_t at = below(random, reach);
         const std::size_t count = std::min(input.size() - at, 1 + below(random, 24));

@@ -1,7 +1,7 @@
-// FinishedRecord and FinalGather: what is taken lies within the tile that it names, nothing else of the image is
-// touched, tiles of other owners and tiles that come twice are refused, and a record comes back the same.
+// FinishedRecord and FinalGather: pixels are written only within the tile that a record names, tiles of other owners
+// and repeated tiles are refused, and a record that is written again is the same.
 //
-// An input: format, channels and flags; a batch by its length; what is behind it is a count of tiles.
+// An input: format, channels and flags; the length of a batch and the batch; the rest is a count of tiles.
 #include "fuzz.hpp"
 
 #include <dfb/gather/final_gather.hpp>
@@ -54,7 +54,7 @@ dfb::ChannelMask channelsOf(std::uint8_t byte)
 
 int ownerOf(int tile) { return tile % 2; }
 
-// Planes of exactly the size of a tile.
+// Planes that have exactly the size of a tile.
 struct Pixels {
     Pixels(const FinishedRecord& record, const dfb::Region& region)
     {
@@ -87,7 +87,7 @@ std::string recordOf(const FinishedRecord& record, int tile, const d::FinishedPl
     return fuzz::textOf(bytes.data(), bytes.size());
 }
 
-// Returns whether it is a record.
+// Returns whether the bytes are a record.
 bool readOne(const FinishedRecord& record, const std::string& bytes, bool splits)
 {
     const auto read = [&](const std::string& from, int& tile, std::unique_ptr<Pixels>& pixels) {
@@ -114,7 +114,7 @@ bool readOne(const FinishedRecord& record, const std::string& bytes, bool splits
     return true;
 }
 
-// Returns whether the image was complete after it.
+// Returns whether the image was complete after the messages.
 bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t flags, const std::string& batch,
             const std::string& done)
 {
@@ -124,7 +124,7 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     config.messages.codec = flags & HasCodec ? codec() : nullptr;
     const auto send = [](dfb::Buffer&&, std::size_t) {};
     d::FinalGather display(pool, layout(), config, channels, 0, 0, 2, ownerOf, send, nullptr);
-    if (flags & Shared) // other ranks put tiles into it
+    if (flags & Shared) // other ranks write tiles into the image
         display.shareImage([](const std::byte*) { return 0; });
     display.newFrame(1, false, {});
     auto& image = const_cast<dfb::Image&>(display.image());
@@ -161,7 +161,7 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     fuzz::require(!isComplete || counted, "nothing is complete before the count has come");
     fuzz::require(!give(d::MessageKind::TilesDone, done), "a second count is refused");
     give(d::MessageKind::FinishedTiles, body);
-    for (int tile = 0; tile < layout().tileCount(); tile += 2) { // those of rank 0
+    for (int tile = 0; tile < layout().tileCount(); tile += 2) { // the tiles of rank 0
         const dfb::Region r = layout().region(tile);
         for (int y = r.y0; y < r.y1; ++y) {
             const std::byte* row = image.bytes() + pixelBytes * static_cast<std::size_t>(y * width + r.x0);
@@ -173,7 +173,7 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     return isComplete;
 }
 
-// Returns whether it was good.
+// Returns whether the input was accepted.
 bool take(fuzz::Input in)
 {
     const auto what = in.take<std::uint8_t>(), flags = in.take<std::uint8_t>();

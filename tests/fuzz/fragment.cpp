@@ -1,5 +1,5 @@
-// decodeFragment: what it takes can be read to its last pixel, lies within its tile, and comes back the same when it is
-// encoded and decoded once more. An input that is read in place lies within the memory that its sender shares.
+// decodeFragment: a fragment that it accepts can be read to its last pixel, lies within its tile, and is the same after
+// it is encoded and decoded once more. An input that is read in place lies within the memory that its sender shares.
 //
 // An input: flags, then a FragmentHeader and the payload.
 #include "fuzz.hpp"
@@ -43,11 +43,11 @@ d::WireCoder coderFor(std::uint8_t flags)
 
 const dfb::TileLayout& layout()
 {
-    static const dfb::TileLayout whole(20, 13, side); // those at the border are 4 wide and 5 high
+    static const dfb::TileLayout whole(20, 13, side); // border tiles are 4 wide or 5 high
     return whole;
 }
 
-// The memory that the sender shares; a byte beyond it is not ours.
+// The memory that the sender shares. Reading beyond it is an error.
 const std::vector<float>& sharedFloats()
 {
     static const std::vector<float> floats = [] {
@@ -73,7 +73,7 @@ dfb::Fragment decode(dfb::MemoryPool& pool, dfb::Buffer&& message, const dfb::Co
         nullptr);
 }
 
-// The fragment as a tile; checks what may be relied on of spans and counts.
+// Copies the fragment to a tile, and checks what callers may assume of spans and counts.
 std::unique_ptr<Tile> tileOf(const dfb::Fragment& fragment)
 {
     auto tile = std::make_unique<Tile>();
@@ -121,7 +121,7 @@ bool isActive(const Tile& tile, int x, int y, bool byDepth)
                    : p[0] != 0 || p[1] != 0 || p[2] != 0 || p[3] != 0;
 }
 
-// The same words; 0 and -0 are, which rounding may turn into each other.
+// Whether the words are equal, where 0 equals -0, as rounding may turn one into the other.
 bool areAlike(const std::byte* a, const std::byte* b, std::size_t words)
 {
     for (std::size_t i = 0; i < 4 * words; i += 4) {
@@ -152,7 +152,7 @@ bool isSame(const dfb::TileHeader& a, const dfb::TileHeader& b)
            && a.generation == b.generation && a.children == b.children && a.source == b.source && a.part == b.part;
 }
 
-// The message of a tile; with WireFormat::Bytes, of an 8-bit image of it.
+// The message of a tile or, with WireFormat::Bytes, of an 8-bit image of the tile.
 dfb::Buffer encode(dfb::MemoryPool& pool, const Tile& tile, dfb::ChannelMask channels, const dfb::Codec* with,
                    const d::WireCoder& coder, dfb::WireFormat color)
 {
@@ -168,7 +168,7 @@ dfb::Buffer encode(dfb::MemoryPool& pool, const Tile& tile, dfb::ChannelMask cha
     return d::encodeFragment(pool, bytes, channels, 0, with, coder, dfb::WireFormat::Float32, faults);
 }
 
-// Returns whether it is an input of a tile.
+// Returns whether the bytes are an input of a tile.
 bool take(fuzz::Input in)
 {
     static const auto pool = dfb::MemoryPool::create(false);
@@ -210,9 +210,9 @@ bool take(fuzz::Input in)
     const auto tile = tileOf(fragment);
     fuzz::require(!fragment.isOpaque() || tile->isOpaque(), "what is opaque is so in all pixels");
     if (fragment.encoding() == dfb::FragmentEncoding::InPlace)
-        return true; // of shared floats, which may be out of range
+        return true; // shared floats may be out of range
     if (coder.activeByDepth() && !(fragment.channels() & dfb::depthChannel))
-        return true; // is refused for its channels
+        return true; // refused for its channels
 
     dfb::Buffer again = encode(*pool, *tile, fragment.channels(), with, coder, fragment.colorFormat());
     const dfb::Fragment second = decode(*pool, std::move(again), with, coder);

@@ -1,6 +1,6 @@
-// What the fuzz targets share. Each is a file with LLVMFuzzerTestOneInput(), which libFuzzer or tests/fuzz/driver.cpp
-// calls, and seeds(). A target checks more than that nothing crashes: what is accepted has the properties that the rest
-// of the library counts on, what is refused gave the typed error.
+// Shared by the fuzz targets. Each target is a file with seeds() and LLVMFuzzerTestOneInput(), which libFuzzer or
+// tests/fuzz/driver.cpp calls. A target checks more than crashes: an accepted input must have the properties that the
+// library relies on, and a refused one must give the typed error.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -22,7 +22,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
 
 namespace fuzz {
 
-// Inputs to begin with, each with a name; what `--write-seeds` of the driver writes.
+// The named inputs that fuzzing begins with; the driver writes them with `--write-seeds`.
 std::vector<std::pair<std::string, std::string>> seeds();
 
 [[noreturn]] inline void fail(const std::string& what)
@@ -36,7 +36,7 @@ inline void require(bool holds, const char* what)
         fail(std::string("not so: ") + what);
 }
 
-// An input, read from its front. Behind its end are zeros.
+// An input that is read from its front. After its end come zeros.
 class Input {
 public:
     Input(const std::uint8_t* data, std::size_t size) : next_(data), left_(size) {}
@@ -56,7 +56,7 @@ public:
         left_ -= count;
         return value;
     }
-    // The next bytes, as many as there are of `count`.
+    // The next `count` bytes, or fewer at the end.
     std::string text(std::size_t count)
     {
         const std::string bytes(reinterpret_cast<const char*>(next_), std::min(count, left_));
@@ -72,7 +72,7 @@ private:
     std::size_t left_;
 };
 
-// What Input reads.
+// Writes what Input reads.
 class Output {
 public:
     template <class T>
@@ -105,8 +105,8 @@ std::string textOf(const Bytes& bytes)
     return textOf(bytes.data(), bytes.size());
 }
 
-// Blocks of exactly the size that is asked for, so that AddressSanitizer sees who reads beyond; those of a MemoryPool
-// are larger.
+// Blocks of exactly the requested size, so that AddressSanitizer finds reads beyond them. Those of a MemoryPool are
+// larger.
 class ExactBlocks final : public dfb::BlockOwner {
 public:
     static dfb::Buffer copyOf(const std::string& bytes)

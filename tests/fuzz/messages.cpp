@@ -1,8 +1,9 @@
-// A framebuffer on rank 0 of 2 that gets whatever it is sent: each frame ends, well or with an error of dfb, and
-// nothing else gets out.
+// A framebuffer on rank 0 of 2 that receives arbitrary messages: each frame must end, well or with an error of dfb, and
+// no other exception may leave it.
 //
-// An input: two bytes that say how the framebuffer is made, then messages: the kind, how it is sent, a length, the
-// body. The other rank is played: when the input has nothing more it gives the frame up, as a rank does that works.
+// An input: two bytes that say how the framebuffer is made, then messages, each with its kind, how it is sent, its
+// length and its body. Rank 1 is simulated: after the last message of the input it gives the frame up, as a rank that
+// works would do.
 #include "fuzz.hpp"
 
 #include <dfb/dfb.hpp>
@@ -23,7 +24,7 @@ using d::MessageKind;
 
 constexpr int side = 8, width = 20, height = 13, tileCount = 6;
 constexpr int jobCount = 9;
-constexpr int partialMs = 4; // what a partial frame waits for finished tiles that do not come
+constexpr int partialMs = 4; // how long a partial frame waits for missing finished tiles
 enum Flags : std::uint8_t {
     DisplayElsewhere = 1,
     Declared = 2,
@@ -32,7 +33,7 @@ enum Flags : std::uint8_t {
     Deep = 16,
     NextJobs = 32,
     Gathers = 64,
-    NoConfiguration = 128 // of the other rank: the input says what it was made with
+    NoConfiguration = 128 // of rank 1: the input has its configuration
 };
 enum More : std::uint8_t {
     Partial = 1,
@@ -42,7 +43,7 @@ enum More : std::uint8_t {
     Ordered = 16, // opaque inputs hide others
     more = 31
 };
-// How the framebuffer is made, and with what it begins its frames.
+// How the framebuffer is made and its frames begin.
 struct Way {
     std::uint8_t flags = 0, rest = 0;
 
@@ -55,13 +56,13 @@ struct Way {
         return (has(Wall) ? 1 : 0) + static_cast<std::uint32_t>((frame - 1) % static_cast<int>(engineCount()));
     }
 };
-// How a message is sent. ToAnother: to the wall, or to an object that nobody has made. Awaited: when there is nothing
-// else to be done, such as an answer.
+// How a message is sent. ToAnother: to the wall, or to an object that does not exist. Awaited: only when the receiver
+// waits and no other message comes, such as an answer.
 enum How : std::uint8_t { NextFrame = 1, LastFrame = 2, OtherHeader = 3, numbered = 3, ToAnother = 4, Awaited = 8 };
-constexpr std::uint8_t kinds = 31, endOfFrame = 31; // in place of a kind
+constexpr std::uint8_t kinds = 31, endOfFrame = 31; // takes the place of a kind
 static_assert(static_cast<int>(MessageKind::Leaving) < endOfFrame);
 
-// Tasks run where they are submitted, but never within the delivery of a message, which holds locks.
+// Runs tasks in submit(), but never while a message is delivered, as locks are held then.
 class TaskList final : public dfb::Executor {
 public:
     int concurrency() const noexcept override { return 1; }
@@ -85,7 +86,7 @@ private:
     bool isHeld_ = true; // until the first poll()
 };
 
-// The other rank, and what it sends.
+// Rank 1, which is simulated, and the messages that it sends.
 struct Peer {
     std::shared_ptr<TaskList> tasks = std::make_shared<TaskList>();
     dfb::TransportHandler* handler = nullptr;
@@ -97,13 +98,13 @@ struct Peer {
     std::size_t next = 0;
     std::uint32_t sequence = 0;
     bool checksums = false, isTimed = false; // frames have a time-out
-    std::function<bool()> whenDone;          // sends the rest; false if there is none
+    std::function<bool()> whenDone;          // sends the rest; returns false if there is none
     bool isGone = false;
-    int idle = 0; // naps since something came
+    int idle = 0; // naps since the last message
 
     void send(std::string message, bool isAwaited = false)
     {
-        if (message.size() >= sizeof(d::MessageHeader)) { // or else only the first of a number would be looked at
+        if (message.size() >= sizeof(d::MessageHeader)) { // otherwise only the first with a number would be read
             const auto put = [&](std::size_t at, std::uint32_t value) {
                 message.replace(at, sizeof value, fuzz::Output().put(value).bytes());
             };
@@ -125,7 +126,7 @@ struct Peer {
         tasks->hold(false);
         return true;
     }
-    // Somebody waits and nothing comes.
+    // Called when rank 0 waits and no message comes.
     void nap()
     {
         if (next < script.size()) {
@@ -139,7 +140,7 @@ struct Peer {
             std::this_thread::sleep_for(std::chrono::microseconds(100 * partialMs));
         if (whenDone && idle > (isTimed ? 200 : 2))
             fuzz::fail("a frame that does not end");
-        if (idle >= 3 && !whenDone && !isGone) { // outside frames a rank that is gone is what ends the wait
+        if (idle >= 3 && !whenDone && !isGone) { // outside frames only the loss of the other rank ends a wait
             isGone = true;
             dfb::ErrorInfo gone;
             gone.kind = dfb::ErrorKind::Transport;
@@ -187,7 +188,7 @@ dfb::WallLayout wallLayout()
     return layout;
 }
 
-// What the other rank says of it.
+// What rank 1 says of the wall's configuration.
 std::string wallText(bool checksums)
 {
     d::Agreement::Settings settings;
@@ -245,7 +246,7 @@ std::string reductionOf(std::uint32_t scope, const d::SmallBytes& bytes)
 }
 enum : std::uint32_t { OwnScope, AllDeclared, FrameVerdict };
 
-// `inputsOnTheWay`: how many more the other rank has sent than have arrived there.
+// `inputsOnTheWay`: how many inputs rank 1 has sent that have not arrived.
 std::string vote(Way way, int inputsOnTheWay = 0)
 {
     d::Verdict verdict;
@@ -254,7 +255,7 @@ std::string vote(Way way, int inputsOnTheWay = 0)
     return reductionOf(FrameVerdict, verdict.bytes());
 }
 
-// Has all messages sent that the input has up to the end of a frame.
+// Queues all messages of the input up to the end of a frame.
 void sendAll(Peer& peer, fuzz::Input& in, Way way, std::int64_t frame)
 {
     while (in.left() > 0) {
@@ -263,7 +264,7 @@ void sendAll(Peer& peer, fuzz::Input& in, Way way, std::int64_t frame)
             return;
         const auto how = in.take<std::uint8_t>();
         std::string message = in.text(in.take<std::uint16_t>() % 8192);
-        if ((how & numbered) != OtherHeader) { // or else it is the whole message
+        if ((how & numbered) != OtherHeader) { // otherwise it is the whole message
             const std::int64_t number =
                 frame + ((how & numbered) == NextFrame ? 1 : 0) - ((how & numbered) == LastFrame ? 1 : 0);
             const std::uint32_t another = way.has(Wall) ? 0 : 2;
@@ -314,7 +315,7 @@ public:
                     end(frame, number);
                 }
             }
-        } catch (const dfb::TransportError&) { // it is of no use any more
+        } catch (const dfb::TransportError&) { // it can no longer be used
         }
         peer_->whenDone = nullptr;
         return fine_;
@@ -407,7 +408,7 @@ private:
             fine_ += report.failure ? 0 : 1;
         } catch (const dfb::TransportError&) {
             throw;
-        } catch (const dfb::Error&) { // FrameError, and of a wall: the next may be better
+        } catch (const dfb::Error&) { // FrameError, or an error of the wall: the next frame may be good
         }
         peer_->whenDone = nullptr;
     }
@@ -469,7 +470,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
 
 namespace {
 
-// The body of an input of a tile, the one that rank 0 announces or that source 9 has declared.
+// The body of an input of a tile: the one that rank 0 announces, or that source 9 has declared.
 template <class TileOp>
 std::string inputFor(Way way, int index, bool isDense)
 {
@@ -512,7 +513,7 @@ std::string of(MessageKind kind, const std::string& body, int how = 0)
         .bytes();
 }
 
-// The finished tiles 1, 3 and 5 and their count, as two bodies.
+// The bodies of two messages: the finished tiles 1, 3 and 5, and their count.
 std::pair<std::string, std::string> finished(Way way)
 {
     const auto config = configFor(way);
@@ -572,7 +573,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         std::string text = inputs(way);
         if (way.has(Declared)) {
             text.clear();
-            if (isFirst || way.engineCount() > 1) // what it has declared holds in the engine's next frame
+            if (isFirst || way.engineCount() > 1) // a declaration holds in the engine's next frame, too
                 text += of(MessageKind::Manifest, Output().put(2).put(9u).put(std::uint16_t{0}).bytes())
                         + of(MessageKind::ManifestAck, "");
             text += of(MessageKind::ReduceUp, reductionOf(AllDeclared, {}));
@@ -582,14 +583,14 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
             const auto [tiles, count] = finished(way);
             text += of(MessageKind::FinishedTiles, tiles) + of(MessageKind::TilesDone, count);
         }
-        if (way.has(Wall)) // what the other rank owns of the display: tiles 1, 3 and 5
+        if (way.has(Wall)) // the tiles of the display that rank 1 owns: 1, 3 and 5
             text += partsOf({{8, 0, 10, 8}, {0, 8, 8, 13}}) + wallVote;
         return text + of(MessageKind::ReduceUp, vote(way, way.has(Declared) ? 0 : 2)) + end;
     };
     const auto addFrames = [&](Way way) {
         add("frame_" + std::to_string(way.flags) + (way.rest ? "_" + std::to_string(way.rest) : ""), way,
             frameOf(way) + frameOf(way, false));
-        // A partial frame waits for partialMs, in which this process may not get a core.
+        // A partial frame waits for partialMs. This process may get no core in that time, so it may take several tries.
         int tries = way.has(Partial) ? 10 : 1;
         while (play(Input(all.back().second)) != 2)
             require(--tries > 0, "both frames end well");

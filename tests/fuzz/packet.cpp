@@ -1,4 +1,5 @@
-// readPacket: what it visits lies in the packet, in order and apart, and makes the same packet again.
+// readPacket: the messages that it visits lie in the packet, in order and without overlap, and make the same packet
+// again.
 #include "fuzz.hpp"
 
 #include <dfb/comm/packet.hpp>

@@ -1,8 +1,8 @@
-// The readers of dfb_render: what they take is a mesh, atoms or a volume that the renderer can use, and is the same
-// when it is written and read once more; what they refuse is refused with std::runtime_error that begins with the name.
+// The readers of dfb_render: an accepted file is a mesh, atoms or a volume that the renderer can use, and is the same
+// when it is written and read once more. A refused file gives a std::runtime_error that begins with the file's name.
 //
-// An input: a byte that picks the reader and the frame, then the file; of a volume without header its name up to a line
-// break before. A volume with a header has it and the voxels in one file.
+// An input: a byte that picks the reader and the frame, then the file. Before the bytes of a volume without header
+// comes its name, up to a line break. A volume with a header has header and voxels in one file.
 #include "fuzz.hpp"
 
 #include <bricks.hpp>
@@ -45,7 +45,7 @@ bool areSame(const Vec3& a, const Vec3& b) { return a.x == b.x && a.y == b.y && 
 
 bool isFinite(const Vec3& p) { return std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z); }
 
-// What a rank does with it before it renders.
+// What a rank does with the object before it renders.
 template <class Object>
 Scene sceneWith(const Object& object)
 {
@@ -125,7 +125,7 @@ void useVolume(VolumeSource& source, const VolumeFile& file, const std::string& 
                           "voxels are finite");
     try {
         sceneWith(source);
-    } catch (const std::runtime_error&) { // of a spacing that floats are too coarse for
+    } catch (const std::runtime_error&) { // the spacing is too fine for floats
         fuzz::require(info.spacing.x != info.spacing.y || info.spacing.x != info.spacing.z,
                       "cubic voxels can be told apart");
     }
@@ -136,7 +136,7 @@ void checkVolume(const std::string& bytes)
     const std::size_t end = std::min(bytes.find('\n'), bytes.size());
     const std::string file = bytes.substr(0, end), voxels = bytes.substr(std::min(end + 1, bytes.size()));
     if (file.find('\0') != std::string::npos)
-        return; // no path can have it
+        return; // no path can contain it
     VolumeSource source;
     VolumeFile described;
     try {
@@ -150,7 +150,7 @@ void checkVolume(const std::string& bytes)
     useVolume(source, described, voxels);
 }
 
-// Of a header whose voxels are behind it, or in another file, which is not looked for.
+// Checks a header. Its voxels follow it, or are in another file, which is not opened.
 void checkHeader(const std::string& bytes, VolumeFile (*parse)(std::istream&, const std::string&))
 {
     VolumeSource source;

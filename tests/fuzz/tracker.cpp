@@ -1,5 +1,5 @@
-// DependencyTracker beside a model that looks at all that has come anew each time: complete exactly when the model says
-// so, an error exactly when what has come cannot be part of any tree.
+// Compares DependencyTracker with a model that looks at all inputs anew each time. The tracker must be complete exactly
+// if the model is, and must give an error exactly if the inputs cannot be part of any tree.
 //
 // An input: how many roots, then a byte for what comes next, and what belongs to it.
 #include "fuzz.hpp"
@@ -19,12 +19,12 @@ namespace {
 
 using Names = std::vector<dfb::DependencyTracker::Declared>;
 
-// What has come; `contradicts()` if no tree can have it.
+// All inputs so far. `State::contradicts` says that no tree can have them.
 class Model {
 public:
     explicit Model(int rootCount) : rootCount_(rootCount) {}
 
-    // False if the input by itself cannot be.
+    // Returns false if the input is invalid by itself.
     bool arrive(int generation, std::uint32_t source, std::uint16_t part, int children)
     {
         if (generation < 0 || generation >= dfb::DependencyTracker::maxGenerations || children < 0
@@ -46,7 +46,7 @@ public:
 
     struct State {
         bool contradicts = false, complete = false;
-        int generation = 0; // the first that is not complete
+        int generation = 0; // the first incomplete one
         std::int64_t expected = 0, got = 0;
     };
     State state() const
@@ -106,7 +106,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
         int generation = 0, children = 0;
         std::uint32_t source = 0;
         std::uint16_t part = 0;
-        if (what == Arrive) { // small numbers, so that they meet
+        if (what == Arrive) { // small numbers, so that inputs collide
             const auto a = in.take<std::uint8_t>(), b = in.take<std::uint8_t>();
             generation = a % 5;
             children = a / 5 % 4;
@@ -119,7 +119,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
             children = in.take<std::int32_t>();
         } else if (what == Declare) {
             if (std::exchange(declared, true))
-                continue; // once is what its contract says
+                continue; // its contract allows only one call
             for (int left = in.take<std::uint8_t>() % 8; left > 0; --left) {
                 const auto b = in.take<std::uint8_t>();
                 names.push_back({b % 8u, static_cast<std::uint16_t>(b / 8 % 2)});
@@ -151,7 +151,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
             fuzz::require(error->kind == Kind::TooManyInputs || error->kind == Kind::DuplicateInput
                               || error->kind == Kind::UnannouncedInput || error->kind == Kind::NegativeChildren,
                           "the error is of a tree");
-            roots = 1; // of no further use until it is reset
+            roots = 1; // an error ends its use until reset()
             tracker.reset(roots);
             model = Model(roots);
             declared = false;

@@ -1,11 +1,11 @@
-// A job with a live view, as its user starts and ends it: job CASE COMMAND...
-//   button     the button on the page ends it
-//   interrupt  Ctrl-C ends it, as the launcher passes it on
-//   rest       while the camera rests its ranks do nothing
-//   fire       any camera that viewers may ask for is rendered
-//   step       a simulation is paused, taken a step on, and let go on
+// Runs a job with a live view, as its user starts and ends it: job CASE COMMAND...
+//   button     the button on the page ends the job
+//   interrupt  Ctrl-C ends the job, as the launcher passes it on
+//   rest       while the camera rests, the ranks use no processor time
+//   fire       every camera that a viewer may ask for is rendered
+//   step       a simulation is paused, advanced by a step, and resumed
 //   taken      a second job on the same port ends with 1
-// COMMAND starts it with --live 0. It must end with 0, and say so in time.
+// COMMAND starts the job with --live 0. The job must end with 0 within a time limit.
 #include <httplib.h>
 #include <nlohmann/json.hpp>
 
@@ -35,7 +35,7 @@ using Clock = std::chrono::steady_clock;
 
 [[noreturn]] void fail(const std::string& why) { throw std::runtime_error(why); }
 
-// The job, and a viewer.
+// The job and a viewer of it.
 class Job {
 public:
     explicit Job(char** command)
@@ -46,7 +46,7 @@ public:
         pid_ = fork();
         if (pid_ == 0) {
             setpgid(0, 0);
-            prctl(PR_SET_PDEATHSIG, SIGTERM); // or the job would outlive a test that is killed
+            prctl(PR_SET_PDEATHSIG, SIGTERM); // otherwise the job would outlive a test that is killed
             dup2(ends[1], STDOUT_FILENO);
             dup2(open("/dev/null", O_RDONLY), STDIN_FILENO);
             close(ends[0]);
@@ -69,7 +69,7 @@ public:
             fail("it has printed no address: " + said);
         port_ = std::atoi(url_.c_str() + url_.rfind(':') + 1);
         token_ = url_.substr(url_.find("token=") + 6);
-        reader_ = std::thread([output] { // it may go on printing
+        reader_ = std::thread([output] { // the job may go on printing
             char more[512];
             while (std::fgets(more, sizeof more, output))
                 std::fputs(more, stdout);
@@ -92,7 +92,7 @@ public:
             fail("no statistics");
         return json::parse(answer->body);
     }
-    // The number of the wishes then.
+    // Returns the number of the viewer's wishes after the post.
     std::uint64_t post(const std::string& name, const json& body) const
     {
         const auto answer = client().Post(path(name), body.dump(), "application/json");
@@ -100,7 +100,7 @@ public:
             fail(name + " was refused: " + body.dump());
         return json::parse(answer->body)["wishes"].get<std::uint64_t>();
     }
-    // Waits for pictures until there is one of these wishes, with all samples if `isRefined`; returns its statistics.
+    // Waits for a picture with these wishes, with all samples if `isRefined`. Returns its statistics.
     json see(std::uint64_t wishes, bool isRefined) const
     {
         std::string last = "0";
@@ -120,9 +120,9 @@ public:
     }
 
     int port() const { return port_; }
-    void interrupt() const { kill(-pid_, SIGINT); } // as a terminal does: all that is in the foreground
+    void interrupt() const { kill(-pid_, SIGINT); } // as a terminal does: to all processes in the foreground
 
-    // Waits for its end.
+    // Waits until the job has ended.
     void expectEnd()
     {
         int status = 0;
@@ -135,7 +135,7 @@ public:
             fail("it has ended with " + std::to_string(WIFEXITED(status) ? WEXITSTATUS(status) : -WTERMSIG(status)));
     }
 
-    // Seconds of processor time that its processes have taken so far, each by itself.
+    // Seconds of processor time so far, for each process of the job.
     std::vector<double> processorTimes() const
     {
         std::vector<double> times;
@@ -168,7 +168,7 @@ private:
     }
     std::string path(const std::string& name) const { return name + "?token=" + token_; }
 
-    // Whether that process descends from the job.
+    // Whether that process is the job or descends from it.
     bool isMine(int pid) const
     {
         while (pid > 1 && pid != pid_) {
@@ -196,7 +196,7 @@ void rest(const Job& job)
     job.see(0, true);
     const std::vector<double> before = job.processorTimes();
     const auto begin = Clock::now();
-    std::this_thread::sleep_for(std::chrono::seconds(3)); // it is the time that is measured
+    std::this_thread::sleep_for(std::chrono::seconds(3)); // the time over which it is measured
     const std::vector<double> after = job.processorTimes();
     const double passed = std::chrono::duration<double>(Clock::now() - begin).count();
     if (before.empty() || before.size() != after.size())
@@ -214,7 +214,7 @@ void fire(const Job& job)
 {
     const auto seed = std::random_device{}();
     std::printf("seed of the cameras: %u\n", seed);
-    std::fflush(stdout); // in case it is killed
+    std::fflush(stdout); // in case the test is killed
     std::mt19937 random(seed);
     const auto pick = [&](const std::vector<double>& values) {
         return values[std::uniform_int_distribution<std::size_t>(0, values.size() - 1)(random)];
@@ -238,16 +238,16 @@ void fire(const Job& job)
     job.post("/camera", {{"distance", 2}, {"width", 64}, {"height", 48}, {"target", target}});
 }
 
-// For a picture every 20 steps.
+// For a job with a picture every 20 steps.
 void step(const Job& job)
 {
     job.post("/command", {{"command", "pause"}});
-    // Each answer to a wish is a picture of the step that it is paused at.
+    // Every answer to a wish is a picture of the step at which the job is paused.
     const auto pausedAt = [&](double azimuth) {
         return job.see(job.post("/camera", {{"azimuth", azimuth}}), false)["frame"]["step"].get<int>();
     };
     int at = 0;
-    for (int i = 1; i < 1000 && !(at > 0 && pausedAt(i) == at); i += 2) // it goes on to its next picture
+    for (int i = 1; i < 1000 && !(at > 0 && pausedAt(i) == at); i += 2) // it runs on to its next picture
         at = pausedAt(i + 1);
     for (int i = 0; i < 5; ++i)
         if (at % 20 != 0 || pausedAt(-i) != at)
@@ -256,7 +256,7 @@ void step(const Job& job)
     if (next["frame"]["step"] != at + 20 || pausedAt(4) != at + 20)
         fail("a step of " + std::to_string(next["frame"]["step"].get<int>() - at));
     const json whole = job.see(job.post("/camera", {{"distance", 0}}), false);
-    if (!(whole["frame"]["distance"] > 1)) // all of the grid is in the image
+    if (!(whole["frame"]["distance"] > 1)) // far enough that the whole grid is in the image
         fail("a distance of " + whole["frame"]["distance"].dump());
     job.post("/command", {{"command", "go"}});
     for (int last = at; last < at + 100;)

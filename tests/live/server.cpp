@@ -1,4 +1,4 @@
-// LiveView alone: what it answers, and that no viewer can harm or slow the job.
+// LiveView without a job: its answers, and that no viewer can harm or slow the job.
 #include "catch.hpp"
 #include "undisturbed.hpp"
 
@@ -38,7 +38,7 @@ using Clock = std::chrono::steady_clock;
 using std::chrono::milliseconds;
 using std::chrono::seconds;
 
-// Noise, which does not get smaller; RGBA.
+// RGBA noise, which does not compress.
 std::vector<std::uint8_t> pixelsOf(int width, int height, int shade)
 {
     std::vector<std::uint8_t> pixels(4 * static_cast<std::size_t>(width) * static_cast<std::size_t>(height), 255);
@@ -52,7 +52,7 @@ std::vector<std::uint8_t> pixelsOf(int width, int height, int shade)
     return pixels;
 }
 
-// A view that listens on any port, with a scene.
+// A LiveView with a scene, on any free port.
 struct Fixture {
     explicit Fixture(bool hasSteps = true) : made(example::LiveView::listen("a title", 0, hasSteps)), view(*made)
     {
@@ -103,7 +103,7 @@ struct Fixture {
     std::string token;
 };
 
-// A connection of bytes.
+// A TCP connection that sends and receives raw bytes.
 class Socket {
 public:
     explicit Socket(int port) : fd_(::socket(AF_INET, SOCK_STREAM, 0))
@@ -125,7 +125,7 @@ public:
 
     int fd() const { return fd_; }
     bool isOpen() const { return isOpen_; }
-    // False if the other side has hung up.
+    // Returns false if the other side has closed the connection.
     bool send(const std::string& bytes) const
     {
         std::size_t sent = 0;
@@ -137,7 +137,7 @@ public:
         }
         return true;
     }
-    // Returns all bytes that come until the other side hangs up.
+    // Returns all bytes until the other side closes the connection.
     std::string receiveAll() const
     {
         std::string all;
@@ -251,7 +251,7 @@ TEST_CASE("a request for a picture waits for one that is newer")
         },
         takesLong);
     CHECK(number == "2");
-    CHECK(took < seconds(4)); // it is told, and does not look again only when it has waited long
+    CHECK(took < seconds(4)); // the viewer is told at once, not only when its wait ends
 }
 
 TEST_CASE("what viewers want reaches the job, and nonsense does not")
@@ -263,10 +263,10 @@ TEST_CASE("what viewers want reaches the job, and nonsense does not")
     CHECK(wishes.look == 1);
     CHECK(wishes.camera.azimuth == 12.5);
     CHECK(wishes.camera.elevation == -3);
-    CHECK(wishes.camera.distance == 2); // as it was
+    CHECK(wishes.camera.distance == 2); // unchanged
     CHECK(wishes.width == 640);
     CHECK(wishes.height == 480);
-    CHECK(f.post("/camera", R"({"azimuth": 12.5})") == 200); // as it is
+    CHECK(f.post("/camera", R"({"azimuth": 12.5})") == 200); // no change
     CHECK(f.view.wishes().number == 1);
     CHECK(f.post("/camera", R"({"samples": 4, "target": [1, 2, 3.5]})") == 200);
     CHECK(f.view.wishes().samples == 4);
@@ -330,7 +330,7 @@ TEST_CASE("a job that waits for its viewers hears them")
     CHECK(f.view.waitForChange(0, milliseconds::max()).number == 1);
     viewer.join();
 
-    // While it works it is told once, also of what came before.
+    // While the job works, it is told once, also of wishes that came before.
     int told = 0;
     f.view.whileWatching(
         1, false, [&] { ++told; },

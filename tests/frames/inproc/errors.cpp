@@ -802,7 +802,7 @@ TEST_CASE("Pixels outside a finished tile are refused, and nothing is written", 
 {
     std::vector<float> colors(4 * 8 * 8, 1.0f), depths(8 * 8, 1.0f);
     dfb::detail::Planes planes;
-    planes.at[dfb::detail::Color] = reinterpret_cast<std::byte*>(&colors[4 * 8]); // begins at the second row, as do the depths
+    planes.at[dfb::detail::Color] = reinterpret_cast<std::byte*>(&colors[4 * 8]); // from the second row on, as Depth
     planes.at[dfb::detail::Depth] = reinterpret_cast<std::byte*>(&depths[8]);
     dfb::FinishedTile tile({0, 0, 7, 5}, dfb::OutputFormat::RGBA32F, planes, 8);
     const std::vector<double> doubles(4 * 8);
