@@ -1,4 +1,4 @@
-// STL and glTF files, which Assimp reads; and that what is wrong is one line.
+// STL and glTF files, which Assimp reads. Each error is a single line.
 #include "support.hpp"
 #include "together.hpp"
 
@@ -64,7 +64,7 @@ std::string binaryStl(std::uint32_t count = 4)
     return bytes;
 }
 
-// One triangle, twice as large and moved, in a colour.
+// One triangle, scaled by 2 and moved, with a colour.
 std::string gltfJson(const std::string& buffer)
 {
     return "{\"asset\":{\"version\":\"2.0\"},\"scene\":0,\"scenes\":[{\"nodes\":[0]}],"

@@ -1,5 +1,5 @@
-// Cutting a scene into bricks: the cells tile it, a brick holds its part and no more, and the image does not show
-// where the cuts were, nor who rendered what.
+// Cutting a scene into bricks: the cells tile the scene, a brick holds its part and no more, and the image shows
+// neither the cuts nor who rendered what. Up to 14 ranks, which are threads.
 #include "support.hpp"
 
 #include <content_cut.hpp>
@@ -37,8 +37,8 @@ int cellsWith(const std::vector<Box>& cells, const Vec3& p)
     return static_cast<int>(std::count_if(cells.begin(), cells.end(), [&](const Box& c) { return c.contains(p); }));
 }
 
-// All faces of all cells cut the bounds into blocks that lie in a cell wholly or not at all. So the lower corners of
-// the blocks tell whether the cells tile the half-open bounds.
+// The faces of all cells cut the bounds into blocks, each of which lies either wholly in a cell or wholly outside it.
+// So it is enough to test the lower corners of the blocks.
 void checkTiling(const std::vector<Box>& cells, const Box& bounds)
 {
     std::set<float> planes[3];
@@ -59,7 +59,7 @@ void checkTiling(const std::vector<Box>& cells, const Box& bounds)
                 const Vec3 p{x, y, z};
                 const bool inside = x < bounds.hi.x && y < bounds.hi.y && z < bounds.hi.z;
                 wrong += cellsWith(cells, p) != (inside ? 1 : 0);
-                // The last point before all three planes.
+                // The last representable point below all three planes.
                 const float least = -std::numeric_limits<float>::infinity();
                 const Vec3 q{std::nextafter(x, least), std::nextafter(y, least), std::nextafter(z, least)};
                 wrong += cellsWith(cells, q) != (bounds.contains(q) ? 1 : 0);
@@ -114,7 +114,7 @@ dfb::FrameBufferConfig configOf(const example::RenderSettings& settings, const R
     return config;
 }
 
-// Renders on ranks that are threads, each with its own bricks only, as dfb_render does.
+// Renders with ranks that are threads, each with only its own bricks, as dfb_render does.
 Picture render(const Scene& scene, const example::RenderSettings& settings, const Run& run)
 {
     Picture picture;
@@ -164,7 +164,7 @@ float largestDifference(const std::vector<float>& a, const std::vector<float>& b
     REQUIRE(a.size() == b.size());
     float largest = 0;
     for (std::size_t i = 0; i < a.size(); ++i)
-        if (a[i] != b[i]) // infinite depths are equal; a NaN is the largest
+        if (a[i] != b[i]) // infinite depths are equal; a NaN counts as infinitely far off
             largest = std::max(largest, std::isfinite(a[i] - b[i]) ? std::fabs(a[i] - b[i])
                                                                    : std::numeric_limits<float>::infinity());
     return largest;
@@ -176,7 +176,7 @@ void checkSame(const Picture& a, const Picture& b)
     CHECK(a.depth == b.depth);
 }
 
-// The tolerance for where a ray's sum is cut, and as much for the depth of a camera that is some units away.
+// The tolerance is for cutting a ray's sum, and as much for the depth of a camera that is some units away.
 void checkNoSeams(const Picture& a, const Picture& b)
 {
     CHECK(largestDifference(a.rgba, b.rgba) <= 2e-5f);
@@ -192,11 +192,11 @@ example::RenderSettings settingsOf(int width, int height)
     return settings;
 }
 
-// Cut in all these ways, by these numbers of ranks, the scene looks the same.
+// The scene looks the same, cut into these numbers of bricks and rendered by these numbers of ranks.
 void checkCuts(const Scene& scene, const example::RenderSettings& settings)
 {
     const Picture whole = render(scene, settings, {1, 1});
-    checkSame(render(scene, settings, {3, 0}), whole); // each ray in one go either way
+    checkSame(render(scene, settings, {3, 0}), whole); // not cut in either case
     for (const int bricks : {2, 3, 5, 8}) {
         INFO(bricks << " bricks");
         const Picture one = render(scene, settings, {1, bricks});
@@ -208,7 +208,7 @@ void checkCuts(const Scene& scene, const example::RenderSettings& settings)
     }
 }
 
-// Two of a kind, with faces exactly on the planes at which a scene of [-2, 2]^3 is cut in 8.
+// Two squares of each kind, with faces exactly on the planes at which a scene of [-2, 2]^3 is cut in 8.
 example::Mesh walls()
 {
     example::Mesh mesh;
@@ -307,7 +307,7 @@ TEST_CASE("Path tracing converges, and depends on its seed", "[cut]")
     const Picture better = render(scene, settings, {1, 0});
     CHECK(a.hash() != b.hash());
     CHECK(error(b) > 0.01);
-    CHECK(error(better) < 0.5 * error(b)); // a quarter, were the two independent of the converged one
+    CHECK(error(better) < 0.5 * error(b)); // it would be a quarter if both were independent of the converged image
 }
 
 TEST_CASE("Cells tile the bounds and are disjoint", "[cut]")
@@ -352,7 +352,7 @@ TEST_CASE("Cells that are cut by content tile the bounds, too", "[cut]")
         for (const int count : {1, 2, 3, 7, 8, 17, 64}) {
             INFO(count << " cells");
             example::RenderSettings settings = settingsOf(96, 64);
-            settings.frames = count; // of which not all are looked at
+            settings.frames = count; // not all of them are looked at
             settings.view.distance = count == 7 ? 0.0f : 2.0f;
             const std::vector<Box> cells = cellsOf(scene, settings, count);
             REQUIRE(cells.size() == static_cast<std::size_t>(count));
@@ -362,7 +362,7 @@ TEST_CASE("Cells that are cut by content tile the bounds, too", "[cut]")
 
 TEST_CASE("Bricks that are cut by content take equally long", "[cut]")
 {
-    // Most of it is empty, as in a scan: a ball in a corner, and a thin plate.
+    // Most of the scene is empty, as in a scan: a ball in a corner, and a thin plate.
     Scene scan;
     scan.add(example::detail::generatedVolume({128, 96, 80},
                                               [](int x, int y, int z) {
@@ -401,7 +401,7 @@ TEST_CASE("Bricks that are cut by content take equally long", "[cut]")
                 CHECK(busiest(*scene, settings, cellsOf(*scene, settings, 8)) < 1.25);
                 CHECK(busiest(*scene, settings, cutScene(*scene, 8)) > 1.3);
             }
-    // Surfaces whose hits send out rays.
+    // Surfaces whose hits cast ambient occlusion rays.
     Scene knot;
     knot.add(example::detail::torusKnot(400, 12), true);
     example::RenderSettings settings = settingsOf(128, 128);
@@ -439,7 +439,7 @@ TEST_CASE("A generated volume has a brick of 64 voxels a side for each cell", "[
         const std::vector<Box> cells = cutScene(scene, count);
         REQUIRE(cells.size() == static_cast<std::size_t>(count));
         checkTiling(cells, scene.bounds);
-        // Cut otherwise it is cut all the same.
+        // The scene is cut anew for another number of cells.
         checkTiling(cutScene(scene, count + 1), scene.bounds);
     }
     CHECK(example::nearCubicGrid(8) == Index3{2, 2, 2});
@@ -485,7 +485,7 @@ TEST_CASE("A brick holds its part of the volume, with ghosts, and no more", "[cu
         const example::VoxelBlock& block = brick.volumes[0].block;
         CHECK(count(block) >= 66u * 66u * 66u);
         CHECK(count(block) <= 72u * 72u * 72u); // of 128^3
-        // Interpolation of values and gradients at any point in the cell reads from one voxel before to two behind.
+        // Interpolation of values and gradients reads from one voxel before a point in the cell to two behind it.
         for (int axis = 0; axis < 3; ++axis) {
             const std::size_t a = static_cast<std::size_t>(axis);
             const float scale = component(object.placement.scale, axis),
@@ -497,11 +497,11 @@ TEST_CASE("A brick holds its part of the volume, with ghosts, and no more", "[cu
             CHECK(block.lo()[a] <= static_cast<int>(first) - 1);
             CHECK(block.hi()[a] >= static_cast<int>(behind) + 3);
         }
-        // Its voxels are those of the whole.
+        // The voxels of the brick are those of the whole volume.
         const example::VoxelBlock all(object.source, block.lo(), {block.hi()[0], block.hi()[1], block.lo()[2] + 1});
         CHECK(std::equal(all.data<std::uint8_t>(), all.data<std::uint8_t>() + count(all), block.data<std::uint8_t>()));
     }
-    // A cell where the volume is not holds nothing of it.
+    // A cell outside the volume holds no part of it.
     Box aside;
     aside.lo = {5, 5, 5};
     aside.hi = {6, 6, 6};
@@ -681,7 +681,7 @@ TEST_CASE("The image does not depend on who renders a brick, who owns a tile, an
     const Picture one = render(scene, settings, {1, 5});
     CHECK(one.report.tilesTotal == 12);
     Run run{4, 5};
-    run.rankOf = [](int, int, int) { return 3; }; // all others, and so the display rank, without data
+    run.rankOf = [](int, int, int) { return 3; }; // the other ranks, and with them the display rank, have no data
     checkSame(render(scene, settings, run), one);
     run.rankOf = [](int brick, int, int ranks) { return 1 + (4 * brick + 2) % (ranks - 1); };
     checkSame(render(scene, settings, run), one);

@@ -1,4 +1,4 @@
-// The default view: all there is to see is in the image, whatever its shape, and fills it.
+// The default view: everything visible is in the image, whatever the image's shape, and fills it.
 #include "support.hpp"
 
 #include <generated.hpp>
@@ -31,7 +31,7 @@ std::vector<example::Sphere> corners(const Vec3& lo, const Vec3& hi, float radiu
     return spheres;
 }
 
-// All that can be seen, as points: of spheres what lies farthest in 26 directions.
+// Points of everything visible. Of a sphere, the farthest points in 26 directions.
 std::vector<Vec3> pointsOf(const Scene& scene)
 {
     std::vector<Vec3> points;
@@ -52,7 +52,7 @@ std::vector<Vec3> pointsOf(const Scene& scene)
     return points;
 }
 
-// How far out the farthest of the points is in the image: 1 is the border, infinity behind the camera.
+// The largest distance of the points from the image's centre: 1 is at the border, infinity is behind the camera.
 float farthestOf(const std::vector<Vec3>& points, const dfb::PerspectiveCamera& camera,
                  const example::RenderSettings& image)
 {
@@ -94,7 +94,7 @@ std::vector<std::pair<std::string, Scene>> scenes()
     return all;
 }
 
-// Points on the border of what a camera has for an image: of the image, of each eye's half, or of the dome's circle.
+// Points on the border of a camera's image: of the whole image, of each eye's half, or of the dome's circle.
 std::vector<std::pair<double, double>> borderOf(CameraKind kind, int width, int height)
 {
     std::vector<std::pair<double, double>> points;
@@ -136,7 +136,7 @@ TEST_CASE("Every point of a scene is in the default view", "[framing]")
                         farthest = std::max(farthest, farthestOf(points, camera.pinhole(), settings));
                     }
                 CHECK(farthest < 1.0f);
-                if (name == "a sphere") // as large as it can be
+                if (name == "a sphere") // it fills as much as possible
                     CHECK(farthest > 0.8f);
             }
     }
@@ -146,7 +146,7 @@ TEST_CASE("No kind of camera cuts off a scene by default", "[framing]")
 {
     for (const auto& [name, scene] : scenes()) {
         if (!scene.volumes.empty())
-            continue; // there is nothing that a ray would hit
+            continue; // a volume has no surface that a ray would hit
         const example::SceneInfo info(scene);
         example::Brick brick = loadBrick(scene, 0, scene.bounds);
         const example::Surfaces surfaces(scene.bounds, std::move(brick.meshes), std::move(brick.spheres));

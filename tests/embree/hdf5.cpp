@@ -1,4 +1,4 @@
-// Volumes in HDF5 files: all types and layouts, each rank its part; and that what is wrong is one line.
+// Volumes in HDF5 files: all types and layouts are read, each rank reads its part, and each error is a single line.
 #include "support.hpp"
 #include "together.hpp"
 
@@ -46,7 +46,7 @@ std::vector<double> valuesOf(bool hasSign)
 }
 
 struct Layout {
-    std::vector<hsize_t> extent, chunk; // no chunk: all in one piece
+    std::vector<hsize_t> extent, chunk; // no chunk: contiguous
     bool isPacked = false;
     H5Z_filter_t filter = 0; // of the test's own
 };
@@ -111,7 +111,7 @@ TEST_CASE("Data sets of all types and layouts are read, each rank its part", "[h
                         return "other voxels";
                     if (bytes > 1 && source.info.minimum != (type.hasSign && !type.isFloat ? -60.0f : 0.0f))
                         return "another range";
-                    // A share of the range and of the look, and a few rows.
+                    // Allowed are a share of the voxels for the range and the look, and a few rows.
                     return read > 2 * rows / static_cast<std::size_t>(ranks) + 100 * bytes ? "read too much" : "";
                 });
                 for (const std::string& result : results)

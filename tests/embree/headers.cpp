@@ -1,5 +1,5 @@
-// Volumes with a header: what is read of .nrrd, .nhdr, .mha and .mhd, voxels that are no cubes, and that what is wrong
-// is one line that names the file and the line, the same on all ranks.
+// Volumes with a header: what is read of .nrrd, .nhdr, .mha and .mhd files, and voxels that are not cubes. Each error
+// is a single line that names the file and the line, and is the same on all ranks.
 #include "support.hpp"
 #include "together.hpp"
 
@@ -22,7 +22,7 @@ using test::ofRanks;
 
 namespace {
 
-// 3x2x4 values that all types have, or that those with a sign have.
+// 3x2x4 values that all types can hold or, with `hasSign`, all signed types.
 std::vector<double> valuesOf(bool hasSign)
 {
     std::vector<double> values;
@@ -72,7 +72,7 @@ std::string metaOf(const std::string& type, bool isBigEndian, const std::string&
            + "ElementType = " + type + '\n' + more;
 }
 
-// Whether the volume has these voxels.
+// Whether the volume has these voxel values.
 template <class T>
 bool hasValues(const VolumeSource& source, const std::vector<double>& values)
 {
@@ -309,7 +309,7 @@ TEST_CASE("A volume is as large as its spacing says", "[headers]")
 
 TEST_CASE("Voxels that are no cubes have the light and opacity of cubes", "[headers]")
 {
-    // One field on two grids. It is linear, so that nothing is lost by leaving slices out.
+    // The same field on two grids. It is linear, so that leaving out slices loses nothing.
     const auto sampler = [](int slices, float thickness) {
         VolumeSource source;
         source.info.dims = {17, 17, slices}; // longest along the thick sides

@@ -1,4 +1,5 @@
-// Loading a scene together: each rank reads a part of the files, and all come to what one rank alone comes to.
+// Loading a scene together: each rank reads a part of the files, and all get the same scene as a single rank. Ranks are
+// threads.
 #include "support.hpp"
 #include "together.hpp"
 
@@ -66,7 +67,7 @@ TEST_CASE("What ranks send each other travels in short rounds, and what stays do
 {
     const int ranks = 3;
     const std::size_t forAll = 70000;
-    const auto part = [](int from, int to) { // of all, if `to` is the number of ranks
+    const auto part = [](int from, int to) { // for all ranks if `to` is the number of ranks
         const std::size_t size = to == ranks ? forAll : from == to ? 3000000 : from == 1 && to == 2 ? 0 : 400000;
         return Loaders::Bytes(size + static_cast<std::size_t>(from), static_cast<std::byte>(1 + from * 16 + to));
     };
@@ -98,7 +99,7 @@ TEST_CASE("What ranks send each other travels in short rounds, and what stays do
     for (std::size_t rank = 0; rank < counts.size(); ++rank) {
         CHECK(counts[rank].areRight);
         CHECK(counts[rank].longest <= (std::size_t{1} << 20) / ranks);
-        // The sizes, and whether all is well, besides.
+        // Besides these: the sizes, and whether all is well.
         CHECK(counts[rank].sent <= (rank == 1 ? 1 : 2) * std::size_t{400000} + forAll + 1000);
     }
 }
@@ -119,7 +120,7 @@ TEST_CASE("A volume is the same for any number of ranks, and none reads more tha
         shorts[i] = static_cast<std::uint16_t>(500 + bytes[i]);
         floats[i] = static_cast<float>(bytes[i]) - 10.5f;
     }
-    shorts[count / 3] = 100; // the least and the greatest are parts of different ranks
+    shorts[count / 3] = 100; // the least and the greatest value are in parts of different ranks
     shorts[count - 1] = 1200;
     floats[7] = std::numeric_limits<float>::quiet_NaN();
     floats[count - 2] = 1e6f;
@@ -138,7 +139,7 @@ TEST_CASE("A volume is the same for any number of ranks, and none reads more tha
                 const auto rank = static_cast<std::size_t>(loaders.rank());
                 const VolumeSource source = openVolume(file, loaders);
                 read[rank] = loaders.bytesRead();
-                // A brick, and one with ghosts beyond the volume.
+                // The block of a brick, and one with ghost voxels outside the volume.
                 const int z = d[2] * loaders.rank() / ranks, end = d[2] * (loaders.rank() + 1) / ranks;
                 const VoxelBlock block(source, {2, 5, z}, {9, 50, end});
                 const VoxelBlock ghosts(source, {-1, -1, -1}, {d[0] + 2, d[1] + 2, d[2] + 2});
@@ -152,7 +153,7 @@ TEST_CASE("A volume is the same for any number of ranks, and none reads more tha
             for (std::size_t rank = 0; rank < texts.size(); ++rank) {
                 CHECK(texts[rank] == alone);
                 CHECK(read[rank] == withBlocks[rank]);
-                // A row of the lattice more or less, a voxel, and a row where nothing is visible.
+                // Parts may differ by a row of the lattice, a voxel, and a row in which nothing is visible.
                 CHECK(read[rank] <= all / static_cast<std::uint64_t>(ranks) + 2 * rows + 4);
                 sum += read[rank];
             }
@@ -166,7 +167,7 @@ TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
     const test::TemporaryFolder folder;
     const std::string good = folder.write("g_2x3x4_uint16.raw", std::string(48, 'g'));
     const std::string missing = folder / "m_2x3x4_uint16.raw";
-    for (const int first : {0, 1, 2}) { // from this rank on
+    for (const int first : {0, 1, 2}) { // ranks from this one on
         const auto errors = ofRanks<std::string>(3, [&](const Loaders& loaders) {
             return errorOf([&] {
                 Scene scene;
@@ -178,7 +179,7 @@ TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
         for (const std::string& error : errors)
             CHECK(error == missing + ": cannot be opened");
     }
-    // Of a file of primitives.
+    // The same for a file of primitives.
     const std::string mesh = folder.write("m.obj", "v 0 0 0\nf 1 2 3\n");
     for (const std::string& file : {mesh, folder / "none.ply", folder / "none.xyz"}) {
         const std::string alone = errorOf([&] {
@@ -194,7 +195,7 @@ TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
              }))
             CHECK(error == alone);
     }
-    // Where the others have no such file rank 0 reads it alone.
+    // If the other ranks have no such file, rank 0 reads it alone.
     const std::string tetrahedron = folder.write("t.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n");
     for (const std::string& error : ofRanks<std::string>(3, [&](const Loaders& loaders) {
              return errorOf([&] {
@@ -205,7 +206,7 @@ TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
              });
          }))
         CHECK(error.empty());
-    // No voxel is finite, on any rank.
+    // If no voxel is finite, every rank gets the error.
     const std::vector<float> nan(24, std::numeric_limits<float>::quiet_NaN());
     const std::string none = folder.write("n_2x3x4_float32.raw", bytesOf(nan));
     for (const std::string& error :

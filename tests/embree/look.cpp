@@ -53,7 +53,8 @@ int coveredPixels(const Tile& tile)
     return count;
 }
 
-// Pixels at which not exactly one of the parts of an opaque picture is the whole's, bit for bit, in all channels.
+// Number of pixels at which not exactly one part of an opaque picture equals the whole picture, bit for bit, in all
+// channels.
 int wrongPixels(const Tile& whole, const std::vector<std::unique_ptr<Tile>>& parts)
 {
     int wrong = 0;
@@ -74,7 +75,7 @@ int wrongPixels(const Tile& whole, const std::vector<std::unique_ptr<Tile>>& par
     return wrong;
 }
 
-// Values are 8 times the distance from the middle of 33^3 voxels, up to 255: spheres around it.
+// 33^3 voxels with 8 times the distance from the middle, up to 255. Isosurfaces are spheres.
 VolumeSource ballVolume(const FileLook& choice)
 {
     VolumeSource source = example::detail::generatedVolume({33, 33, 33}, [](int x, int y, int z) {
@@ -131,7 +132,7 @@ TEST_CASE("What stands behind a file's name says how it is shown", "[look]")
     CHECK(parseSceneFile("v.raw:transfer=viridis:range=1%,200:isovalue=3,-1,3", endings).look.isovalues
           == std::vector<float>{-1, 3});
     CHECK(parseSceneFile("a.ply:color=#ff8000", endings).look.color->x == 1.0f);
-    // Paths with colons, and such that look like settings.
+    // Paths with colons, some of which look like settings.
     for (const char* path : {"a.ply", "c:/d.ply", "a.ply:opacity=0.5.ply", "x:color=1,1,1.raw", "a=b.ply", "a.ply:b"}) {
         CHECK(parseSceneFile(path, endings).path == path);
         CHECK_FALSE(parseSceneFile(path, endings).look.color);
@@ -168,7 +169,7 @@ TEST_CASE("A run's look holds where a file says nothing", "[look]")
 
 TEST_CASE("Colour maps are those of their names", "[look][transfer]")
 {
-    // Published values at a quarter, a half and three quarters; between control points within 7 of 255.
+    // Published values at a quarter, a half and three quarters. Between control points they are within 7 of 255.
     struct Known {
         const char* name;
         float at;
@@ -297,7 +298,7 @@ TEST_CASE("The default look is the same on any number of ranks, and hides the no
     const VolumeLook percent = lookOf(source, lookWith({{"range", "50%,2000"}}), {});
     CHECK(percent.lo == Approx(31).margin(4));
     CHECK(percent.hi == 2000.0f);
-    // Hounsfield units, which an unsigned file has 1024 higher.
+    // Hounsfield units: an unsigned file has values that are 1024 higher.
     CHECK(lookOf(source, lookWith({{"transfer", "bone"}}), {}).lo == 0.0f);
     CHECK(lookOf(source, lookWith({{"transfer", "bone"}, {"range", "7,9"}}), {}).lo == 7.0f);
 }
@@ -329,7 +330,7 @@ TEST_CASE("What looks like a body in a scanner is shown as one", "[look][transfe
     CHECK(head.hi == 4095.0f);
     CHECK(head.isTomography);
     CHECK(lookFor("bone", 10, 1060, 1900, lookWith({{"transfer", "bone"}})).isTomography);
-    CHECK(lookFor("dim", 10, 500, 1900).hi < 2000.0f); // no water
+    CHECK(lookFor("dim", 10, 500, 1900).hi < 2000.0f); // has no water
     CHECK_FALSE(lookFor("dim", 10, 500, 1900).isTomography);
     CHECK(lookFor("bright", 10, 1060, 60000).lo > 10.0f);
     CHECK(lookFor("set", 10, 1060, 1900, lookWith({{"transfer", "viridis"}})).hi < 2000.0f);
@@ -376,7 +377,7 @@ TEST_CASE("An isosurface is where the values are, whole or in bricks, bit for bi
         for (int i = 0; i < 64 * 64; ++i) {
             if (!(whole->color[4 * i + 3] > 0))
                 continue;
-            // 80 is 10 voxels from the centre; interpolation between voxels bends that by less than 0.1.
+            // The value 80 is 10 voxels from the centre. Interpolation between voxels changes that by less than 0.1.
             const Vec3 p{whole->position[3 * i], whole->position[3 * i + 1], whole->position[3 * i + 2]};
             const Vec3 arm = (p - Vec3{0.5f, 0.5f, 0.5f}) * 32;
             const Vec3 n{whole->normal[3 * i], whole->normal[3 * i + 1], whole->normal[3 * i + 2]};
@@ -415,7 +416,7 @@ TEST_CASE("Several isosurfaces lie in each other, and opacity lets the inner one
 
 TEST_CASE("A clip box cuts volumes, meshes and spheres alike", "[look][clip]")
 {
-    // Half of each is left: seen along x it is half as wide.
+    // Half of each scene is left: seen along x, it is half as wide.
     struct Case {
         const char* name;
         Scene whole, half;
@@ -462,7 +463,7 @@ TEST_CASE("A clip box cuts volumes, meshes and spheres alike", "[look][clip]")
         std::vector<std::unique_ptr<Tile>> parts;
         for (const Box& cell : cutScene(c.half, 5))
             parts.push_back(render(c.half, cell, settings));
-        if (std::string(c.name) != "volume") // which is not opaque
+        if (std::string(c.name) != "volume") // the volume is not opaque
             CHECK(wrongPixels(*half, parts) == 0);
         // The clipped scene's bounds are smaller, so that the camera sees it larger by default.
         CHECK(c.half.bounds.extent().z < 0.6f * c.whole.bounds.extent().z);
@@ -492,7 +493,7 @@ TEST_CASE("What a clip box opens shows its inner side, and lets light in", "[loo
     settings.aoDistance = 0.01f;
     const auto lit = render(scene, scene.bounds, settings);
     CHECK(lit->color[4 * (64 * 32 + 32)] == tile->color[4 * (64 * 32 + 32)]);
-    // Half of the light comes through the opening, and none through a whole ball.
+    // Half of the light comes through the opening of the bowl. A whole ball would let none in.
     settings.aoDistance = 2;
     const auto bowl = render(scene, scene.bounds, settings);
     const float part = bowl->color[4 * (64 * 32 + 32)] / tile->color[4 * (64 * 32 + 32)];
@@ -518,7 +519,7 @@ TEST_CASE("Each file has a colour and an opacity of its own", "[look]")
     CHECK(albedo[0] == Approx(0.25));
     CHECK(albedo[2] == Approx(0.75));
     CHECK(tile->color[4 * (64 * 32 + 32) + 3] == 1.0f);
-    settings.opacity = 0.5f; // of the one that has none
+    settings.opacity = 0.5f; // the default for the other one
     const auto both = render(scene, scene.bounds, settings);
     CHECK(both->color[4 * (64 * 32 + 32) + 3] == Approx(1 - 0.75 * 0.5));
 }
@@ -547,7 +548,7 @@ TEST_CASE("A placement scales and turns about the file's centre and then moves i
     CHECK(volume.bounds.largestExtent() == Approx(0.5).epsilon(1e-3));
 }
 
-// Of 33 x 33 voxels, (x, y) shows after a quarter of a turn about z what was at (32 - y, x).
+// In 33^3 voxels, a quarter turn about z moves the voxel (32 - y, x) to (x, y).
 TEST_CASE("A turned volume looks as the volume of the turned voxels", "[look]")
 {
     const example::detail::WaveField field({33, 33, 33}, 5);
@@ -566,7 +567,7 @@ TEST_CASE("A turned volume looks as the volume of the turned voxels", "[look]")
         const auto a = render(turned, turned.bounds, settingsFor()), b = render(moved, moved.bounds, settingsFor());
         CHECK(coveredPixels(*a) > 1000);
         int wrong = 0;
-        for (int i = 0; i < 4 * 64 * 64; ++i) // a ray may graze the outline
+        for (int i = 0; i < 4 * 64 * 64; ++i) // rays may graze the outline
             wrong += !(std::fabs(a->color[i] - b->color[i]) < 1e-3f);
         CHECK(wrong <= 16);
     }
@@ -581,17 +582,17 @@ TEST_CASE("The camera is where it is told to be", "[look][camera]")
     View view;
     view.eye = Vec3{3, 0.5f, 0.5f};
     CHECK(near(FrameCamera(focus, view, 0, 4, 9, 9).pinhole().forward(), {-1, 0, 0}));
-    CHECK(near(FrameCamera(focus, view, 1, 4, 9, 9).pinhole().eye(), {0.5f, 0.5f, -2})); // a quarter, towards -z
+    CHECK(near(FrameCamera(focus, view, 1, 4, 9, 9).pinhole().eye(), {0.5f, 0.5f, -2})); // a quarter turn, towards -z
     view.target = Vec3{3, 0.5f, 7};
     CHECK(near(FrameCamera(focus, view, 0, 4, 9, 9).pinhole().forward(), {0, 0, 1}));
-    view.up = {0, 0, 2}; // along the view: something else is up
+    view.up = {0, 0, 2}; // along the view, so another up vector is chosen
     CHECK(near(FrameCamera(focus, view, 0, 4, 9, 9).pinhole().forward(), {0, 0, 1}));
     View z;
     z.up = {0, 0, 1};
     z.azimuth = z.elevation = 0;
     CHECK(near(FrameCamera(focus, z, 0, 1, 9, 9).pinhole().forward(), {0, 1, 0})); // from -y
     CHECK(near(FrameCamera(focus, z, 0, 1, 9, 9).pinhole().right(), {1, 0, 0}));
-    z.up = {0, 0, -1}; // the other way up, in front of what faces that way
+    z.up = {0, 0, -1}; // upside down, in front of a scene that faces that way
     CHECK(near(FrameCamera(focus, z, 0, 1, 9, 9).pinhole().forward(), {0, -1, 0}));
     CHECK(near(FrameCamera(focus, z, 0, 1, 9, 9).pinhole().right(), {1, 0, 0}));
     z.up = {0, 0, 1};
@@ -600,7 +601,7 @@ TEST_CASE("The camera is where it is told to be", "[look][camera]")
     View same;
     same.eye = same.target = Vec3{1, 1, 1};
     CHECK_FALSE(errorOf([&] { FrameCamera(focus, same, 0, 1, 9, 9); }).empty());
-    // Zoom keeps the place, and makes things larger.
+    // Zoom keeps the position and magnifies.
     View plain, zoomed;
     zoomed.zoom = 2;
     const FrameCamera a(focus, plain, 0, 1, 100, 100), b(focus, zoomed, 0, 1, 100, 100);

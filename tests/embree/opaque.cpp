@@ -1,5 +1,5 @@
-// Rays end at what is opaque: nothing behind it is shaded or sampled, and the image is that of the scene without what
-// is hidden. Counted in the work that the renderer reports, not in time.
+// Rays end at opaque surfaces: nothing behind them is shaded or sampled, and the image is that of the scene without
+// what is hidden. Measured by the work that the renderer reports, not by time.
 #include "support.hpp"
 
 #include <generated.hpp>
@@ -22,7 +22,7 @@ using example::component;
 using example::Scene;
 using example::Vec3;
 
-constexpr int size = 64; // of the image, which is one tile
+constexpr int size = 64; // of the image, which is a single tile
 using Tile = dfb::Tile<dfb::allChannels & ~dfb::farChannel, size>;
 
 example::RenderSettings opaqueSettings()
@@ -48,7 +48,7 @@ struct Picture {
     }
 };
 
-// What a brick with this cell has to show. Where samples are, and where the camera is, is `all`'s.
+// Renders the brick of one cell. `all` is the scene that determines the sampling and the camera.
 Picture render(const Scene& scene, const Box& cell, const Scene& all, const example::RenderSettings& settings)
 {
     const example::SceneInfo info(all);
@@ -64,7 +64,7 @@ Picture render(const Scene& scene, const example::RenderSettings& settings)
     return render(scene, scene.bounds, scene, settings);
 }
 
-// Hits of surfaces that were shaded: each costs another ray where there is another of ambient occlusion.
+// Number of shaded hits: each takes one more ray if there is one more ray for ambient occlusion.
 std::int64_t shadedHits(const Scene& scene, const Box& cell, example::RenderSettings settings)
 {
     settings.aoRays = 2;
@@ -99,7 +99,7 @@ std::vector<example::Sphere> swarm(int count, float radius, const Vec3& lo, cons
     return spheres;
 }
 
-// Across the whole view at this z, and beyond it.
+// A wall across the whole view at this z, and beyond its borders.
 example::Mesh wall(float z) { return {{{-3, -3, z}, {4, -3, z}, {4, 4, z}, {-3, 4, z}}, {{0, 1, 2}, {0, 2, 3}}}; }
 
 Scene thickScene()
@@ -122,7 +122,7 @@ TEST_CASE("Of an opaque scene one hit of each pixel is shaded", "[opaque]")
     CHECK(covered > 800);
     CHECK(shadedHits(scene, scene.bounds, glassy) > 10 * covered); // else there is nothing to save
     CHECK(shadedHits(scene, scene.bounds, settings) == covered);
-    // So do the rays of shadows, of which each hit has one.
+    // Shadow rays end there as well: each shaded hit has one.
     example::RenderSettings shadows = settings;
     shadows.shadows = true;
     CHECK(render(scene, shadows).work - render(scene, settings).work == covered);
@@ -147,7 +147,7 @@ TEST_CASE("Rays end in each brick, and where its ghosts hide it", "[opaque]")
         shaded += parts.back().covered();
     }
     CHECK(shaded < whole.covered() + (alone - whole.covered()) / 2);
-    // What is left out does not show.
+    // Hidden parts that were left out do not show.
     int wrong = 0;
     for (int i = 0; i < size * size; ++i) {
         const Tile* nearest = parts.front().tile.get();
@@ -209,7 +209,7 @@ TEST_CASE("Early termination is for surfaces, too, and keeps its bound", "[opaqu
         CHECK(largest > 0.0f);
         CHECK(largest <= 0.05f * brightest);
 
-        // Over bricks, too.
+        // The same with bricks.
         settings.aoRays = 1;
         settings.earlyTermination = 0;
         const Picture whole = render(scene, settings);

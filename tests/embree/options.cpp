@@ -33,7 +33,7 @@ Options options(const std::vector<std::string>& words)
     return *parsed.options;
 }
 
-// Of the scene demo with these words behind.
+// Checks that the scene `demo` with these words behind it is refused.
 void checkRefused(std::vector<std::string> words)
 {
     words.insert(words.begin(), "demo");
@@ -205,7 +205,7 @@ TEST_CASE("What is wrong on the command line is refused in one line that names i
     checkRefused({"--alpha", "a.png"});
     checkRefused({"--depth", "d.png"});
     checkRefused({"--stats", "s.txt"});
-    checkRefused({"--wall", "2x2", "--size", "91x70"}); // no equal displays
+    checkRefused({"--wall", "2x2", "--size", "91x70"}); // displays would not be equal
     checkRefused({"--wall", "2x2", "--size", "3x3", "--bezel", "2"});
     checkRefused({"--sizes", "5x5"});
     checkRefused({"--size"});
@@ -229,7 +229,7 @@ TEST_CASE("The camera's place and the look arrive", "[options]")
     CHECK(o.files[0].look.opacity == 0.5f);
     CHECK(o.files[0].look.clip);
     CHECK(o.files[1].look.transfer == "bone");
-    CHECK(o.files[1].look.isovalues.empty()); // it says itself how it is shown
+    CHECK(o.files[1].look.isovalues.empty()); // the file has a look of its own
     CHECK(o.look.isovalues == std::vector<float>{3, 7});
     CHECK(options({"demo", "--up=-z"}).view.up.z == -1.0f);
     CHECK(options({"demo", "--transfer", "auto"}).look.transfer.empty());
@@ -251,7 +251,7 @@ TEST_CASE("The camera's place and the look arrive", "[options]")
     for (const std::string value : {"1", "2,1", "1%,2%,3%", "120%,130%", ""})
         checkRefused({"--range=" + value});
     checkRefused({"--isovalue=1,"});
-    checkRefused({"--clip", "0,0,0,1,1,1"}); // of a generated scene
+    checkRefused({"--clip", "0,0,0,1,1,1"}); // not for a generated scene
     checkRefused({"--png-bits", "12", "--output", "a.png"});
     checkRefused({"--png-bits", "16", "--output", "a.pfm"});
     checkRefused({"--png-bits", "16"});
@@ -287,7 +287,7 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
     CHECK(*o.background == std::array<float, 3>{0.0f, 0.5f, 0.0f});
     CHECK(o.output == "b_%03d.png");
     CHECK(options({"demo", "--size", "6x6", "--wall", "1x1", "--wall", "3x2"}).wallColumns == 3);
-    // Every option that takes a value.
+    // All options that take a value.
     const std::vector<std::pair<std::string, std::string>> values{{"--mode", "image"},
                                                                   {"--mode", "mixed"},
                                                                   {"--replicate", "2"},
@@ -346,7 +346,7 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
         std::vector<std::string> with{"demo"};
         with.insert(with.end(), words.begin(), words.end());
         options(with);
-        // Without what they belong to they would do nothing.
+        // Without the option that they belong to they would do nothing, so they are refused.
         checkRefused({words[2], words[3]});
     }
 }
@@ -440,7 +440,7 @@ TEST_CASE("A scene must be named", "[options]")
         CHECK(test::isLineWith(parsed.message, "dfb_render: "));
     }
     CHECK(test::contains(parse({"--size", "5x5"}).message, "scene"));
-    CHECK(test::contains(parse({"--nope"}).message, "--nope")); // which comes before the scene
+    CHECK(test::contains(parse({"--nope"}).message, "--nope")); // found before the missing scene
 }
 
 TEST_CASE("The help says it all", "[options]")

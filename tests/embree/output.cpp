@@ -1,4 +1,4 @@
-// What the bundled renderer writes, read back.
+// The files that the bundled renderer writes, read back.
 #include "support.hpp"
 
 #include <output.hpp>
@@ -23,7 +23,7 @@ using test::isLineWith;
 
 namespace {
 
-// Premultiplied RGBA with values that 8 bits cannot tell apart, beyond 1, and the least there is.
+// Premultiplied RGBA with values that 8 bits cannot distinguish, values above 1, and the smallest positive one.
 std::vector<float> pixels(int width, int height)
 {
     std::mt19937 random(7);
@@ -60,7 +60,7 @@ Pfm readPfm(const std::string& path)
     return pfm;
 }
 
-// The bytes as they are in the file, of this format.
+// The bytes of the file, converted to this format.
 std::vector<std::uint8_t> readPng(const std::string& path, int& width, int& height, png_uint_32 format = PNG_FORMAT_RGB)
 {
     png_image image{};
@@ -74,7 +74,7 @@ std::vector<std::uint8_t> readPng(const std::string& path, int& width, int& heig
     return bytes;
 }
 
-// By the curve itself, not the thresholds that the library compares with.
+// Uses the formula of the curve, not the thresholds that the library compares with.
 double srgbOf(double linear)
 {
     return linear <= 0.0031308 ? 12.92 * linear : 1.055 * std::pow(linear, 1 / 2.4) - 0.055;
@@ -161,7 +161,7 @@ TEST_CASE("A PNG with alpha has straight colours, each the nearest level", "[out
     const test::TemporaryFolder folder;
     const int width = 256, height = 40;
     std::vector<float> rgba = pixels(width, height);
-    for (std::size_t i = 0; i < rgba.size(); i += 4) // most colours at most alpha, the rest as they come
+    for (std::size_t i = 0; i < rgba.size(); i += 4) // most colours are at most alpha, the others are unchanged
         for (std::size_t c = i; c < i + 3; ++c)
             rgba[c] *= i % 16 != 0 ? rgba[i + 3] : 1;
     const float nan = std::numeric_limits<float>::quiet_NaN();
@@ -186,7 +186,7 @@ TEST_CASE("A PNG with alpha has straight colours, each the nearest level", "[out
         wrong += std::abs(straight[i + 3] - 255 * alpha) > 0.5 + 1e-9;
         for (std::size_t c = i; c < i + 3; ++c) {
             const double color = std::min(static_cast<double>(rgba[c]) / alpha, 1.0);
-            // The nearest level: the curve above is good to 1e-9 levels, but for a kink of 1e-6 at its foot.
+            // The nearest level. The curve above is exact to 1e-9 levels, except for a kink of 1e-6 at its foot.
             wrong += std::abs(straight[c] - 255 * srgbOf(color)) > 0.5 + 1e-5;
         }
     }
@@ -195,7 +195,7 @@ TEST_CASE("A PNG with alpha has straight colours, each the nearest level", "[out
 
 TEST_CASE("Dithered colours with alpha keep their mean, also below alpha", "[output]")
 {
-    // Colours of one value each in 8x8 pixels: their mean in light is within 1/64 of a level of the colour.
+    // Each block of 8x8 pixels has one colour. Its mean, in linear light, is within 1/64 of a level.
     const int width = 64, height = 8;
     for (const float alpha : {1.0f, 0.7f, 0.25f}) {
         std::vector<float> rgba;
@@ -227,7 +227,7 @@ TEST_CASE("Dithered colours with alpha keep their mean, also below alpha", "[out
 
 TEST_CASE("The hash is that of the floats", "[output]")
 {
-    // XXH3 with 64 bits as its specification and xxhsum have it.
+    // Values of XXH3 with 64 bits, from its specification and from xxhsum.
     CHECK(hashPixels(nullptr, 0) == "2d06800538d394c2");
     const std::vector<float> one{0.25f, 0.5f, 0.75f, 1.0f};
     CHECK(hashPixels(one.data(), 1) == "4de916efb99ec738");
@@ -319,7 +319,7 @@ TEST_CASE("What cannot be written is an error that names the file", "[output]")
     const std::vector<float> rgba = pixels(64, 64);
     const std::vector<std::uint8_t> srgba(rgba.size());
     std::vector<std::string> paths{folder / "none/x", folder / "folder", ""};
-    const std::string full = "/dev/full"; // takes no byte, says so only when it is written to
+    const std::string full = "/dev/full"; // opens, but fails when it is written to
     if (std::filesystem::exists(full))
         paths.push_back(full);
     for (const std::string& path : paths) {

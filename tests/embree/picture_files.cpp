@@ -1,4 +1,4 @@
-// Files of pictures beyond 8 bits, tables of them, and files of options.
+// Picture files with more than 8 bits, tables of pictures, and option files.
 #include "support.hpp"
 
 #include <cinema.hpp>
@@ -47,7 +47,7 @@ ParsedOptions parse(const std::vector<std::string>& words)
     return parseOptions(static_cast<int>(arguments.size()), arguments.data());
 }
 
-// Rows of 16-bit big-endian pixels, and how many channels they have.
+// Rows of 16-bit big-endian pixels; `channels` is set to their number of channels.
 std::vector<std::vector<std::uint8_t>> readPng16(const std::string& path, int& channels)
 {
     std::vector<std::vector<std::uint8_t>> rows;
@@ -204,7 +204,7 @@ TEST_CASE("The options of a run are read again as they were", "[options][config]
     CHECK(again.options->view.up.z == -1.0f);
     CHECK(optionsText(again.options->scene, again.options->given)
           == optionsText(first.options->scene, first.options->given));
-    // The command line counts more, and TOML will do.
+    // Options of the command line take precedence. A TOML file works as well.
     const ParsedOptions other = parse({"--config", path, "--spp", "5"});
     REQUIRE(other.options);
     CHECK(other.options->passes == 5);

@@ -1,4 +1,4 @@
-// The readers of the bundled renderer: what they take, and that they refuse everything else with one line that
+// The readers of the bundled renderer: which files they accept, and that they refuse all others with a single line that
 // names the file.
 #include "support.hpp"
 
@@ -52,7 +52,8 @@ VolumeSource sourceOf(const std::string& name, const std::string& bytes)
     return source;
 }
 
-// Whether the block [lo, hi) of a volume with these voxels holds them, the nearest one repeated outside.
+// Whether the block [lo, hi) of a volume with these voxels equals them. Outside the volume, the nearest voxel is
+// repeated.
 template <class T>
 bool blockIsPartOf(const std::vector<T>& voxels, const VolumeSource& source, const Index3& lo, const Index3& hi)
 {
@@ -97,7 +98,7 @@ void checkBlocks(const std::string& type)
 
 bool same(const Vec3& a, const Vec3& b) { return a.x == b.x && a.y == b.y && a.z == b.z; }
 
-// Four corners of a square and one point above; a square and a triangle.
+// Four corners of a square and a point above it. The faces are the square and a triangle.
 const std::vector<Vec3> points{{0, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}, {0.5f, 0.25f, -2}};
 
 void checkPoints(const Mesh& mesh)
@@ -123,7 +124,7 @@ const std::string plainElements = "element vertex 5\nproperty float x\nproperty 
                                   "element face 2\nproperty list uchar int vertex_indices\n";
 const std::string asciiBody = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n0.5 0.25 -2\n4 0 1 2 3\n3 4 1 0\n";
 
-// Elements and properties that a reader of meshes has to step over, of all types.
+// Elements and properties of all types that a reader of meshes has to skip.
 const std::string mixedElements =
     "element camera 2\nproperty double focus\nproperty list ushort short marks\nelement nothing 3\n"
     "element vertex 5\nproperty uchar red\nproperty double z\nproperty float32 x\nproperty list uint8 float64 w\n"
@@ -142,7 +143,7 @@ public:
         char bytes[sizeof(T)];
         std::memcpy(bytes, &value, sizeof value);
         for (std::size_t i = 0; i < sizeof(T); ++i)
-            text += bytes[bigEndian_ ? sizeof(T) - 1 - i : i]; // the tests run on little-endian machines, as volumes do
+            text += bytes[bigEndian_ ? sizeof(T) - 1 - i : i]; // the tests run on little-endian machines
         return *this;
     }
     std::string text;
@@ -282,11 +283,11 @@ TEST_CASE("A volume has as many bytes as its name says", "[readers]")
         CHECK(test::contains(error, "24"));
         CHECK(test::contains(error, std::to_string(bytes.size())));
     }
-    // The right bytes under a name with other dimensions or another type.
+    // The right number of bytes under a name with other dimensions or another type.
     CHECK(isLineWith(errorOf([&] { describe("a_2x3x5_uint8.raw", full); }), "30"));
     CHECK(isLineWith(errorOf([&] { describe("a_2x3x4_uint16.raw", full); }), "48"));
     CHECK(isLineWith(errorOf([&] { describe("a_2x3x4_float32.raw", full); }), "96"));
-    // 2^50 bytes, and 0 in 32 bits.
+    // 2^50 bytes, which would be 0 in 32 bits.
     CHECK(isLineWith(errorOf([&] { describe("a_65536x65536x65536_float32.raw", {}); }), "1125899906842624"));
 
     const test::TemporaryFolder folder;
@@ -425,15 +426,15 @@ TEST_CASE("PLY: bad headers, numbers, lists and indices", "[readers]")
     }
     CHECK(isLineWith(plyRefusal(""), "the.file: "));
     CHECK(isLineWith(plyRefusal(plyHeader("ascii", "")), "the.file: "));
-    // Vertices alone are no mesh.
+    // A file with vertices only is not a mesh.
     const std::string noFaces = replaced(plainElements, "face 2", "face 0");
     CHECK(
         isLineWith(plyRefusal(plyHeader("ascii", noFaces) + asciiBody.substr(0, asciiBody.find("4 0"))), "the.file: "));
-    // The list counts of a binary file are data as well.
+    // In a binary file the counts of lists may be damaged as well.
     std::string list = binaryPlain(false);
     list[list.size() - 13] = '\xff';
     CHECK(isLineWith(plyRefusal(list), "the.file: "));
-    // A count that would take 2^64 rows of nothing ends at once.
+    // An element of 2^64 - 1 rows without properties must not take time.
     CHECK(plyRefusal(plyHeader("ascii", "element nothing 18446744073709551615\n" + plainElements) + asciiBody).empty());
 }
 
@@ -445,7 +446,7 @@ TEST_CASE("OBJ: vertices and faces, with all else in the file skipped", "[reader
     for (const char c : plainObj)
         crlf += c == '\n' ? std::string("\r\n") : std::string(1, c);
     checkMesh(parseObj(crlf, "a.obj"));
-    // From the end backwards, at the time of the face.
+    // Negative indices count back from the vertices read so far.
     const Mesh mesh =
         parseObj("v 0 0 0\nv 1 0 0\nv 1 1 0\nf -3 -2 -1\nv 0 1 0\nv 0.5 0.25 -2\nf 1 3 -2\nf 5 2 1\n", "a.obj");
     checkMesh(mesh);
@@ -464,7 +465,7 @@ TEST_CASE("OBJ: bad vertices and faces", "[readers]")
         INFO('\'' << from << "' becomes '" << to << '\'');
         CHECK(isLineWith(objRefusal(replaced(plainObj, from, to)), "the.file: "));
     }
-    // What does not fit into 32 bits, or is more than digits; and lines that end with \r.
+    // Indices that exceed 32 bits or are not only digits, and lines that end with \r.
     for (const char* face : {"f 1 2 4294967299", "f 1 2 3x", "f 1 2 3/x"})
         CHECK(isLineWith(objRefusal(replaced(plainObj, "f -1 2 1", face)), "the.file: "));
     for (const char* lines : {"v 1 nan 0\r", "#\rv 1 nan 0\n"})
@@ -473,7 +474,7 @@ TEST_CASE("OBJ: bad vertices and faces", "[readers]")
     CHECK(isLineWith(objRefusal("v 0 0 0\nv 1 0 0\nv 1 1 0\n"), "the.file: "));
     CHECK(isLineWith(objRefusal("f 1 2 3\n"), "the.file: "));
     CHECK(isLineWith(objRefusal(std::string(1000, '\0')), "the.file: "));
-    // Cut short within a face and within a vertex.
+    // Files that end within a face or within a vertex.
     CHECK(isLineWith(objRefusal(plainObj.substr(0, plainObj.size() - 2)), "the.file: "));
     CHECK(isLineWith(objRefusal(plainObj.substr(0, plainObj.find("v 0.5") + 5)), "the.file: "));
 }
@@ -487,7 +488,7 @@ TEST_CASE("XYZ: atoms with a radius and a colour by element", "[readers]")
     CHECK(same(atoms[2].center, {4, 5, 6}));
     CHECK(atoms[0].radius == 1.70f);
     CHECK(atoms[1].radius == 1.52f);
-    CHECK(atoms[2].radius > 0.0f); // an element that we do not know is drawn all the same
+    CHECK(atoms[2].radius > 0.0f); // unknown elements are drawn as well
     CHECK_FALSE(same(atoms[0].color, atoms[1].color));
     CHECK(parseXyz("1\n\nC 1 2 3\n\n \n", "a.xyz").size() == 1);
 }
@@ -599,12 +600,12 @@ TEST_CASE("XYZ: of several frames the first, or the one that is asked for", "[re
     CHECK(parseXyz(bytes, "a.xyz", 2, &notes).at(1).center.x == 3.0f);
     CHECK(parseXyz(bytes, "a.xyz", 3, &notes).at(0).center.x == 4.0f);
     CHECK(parseXyz("1\n\nC 0 0 0\n\n", "a.xyz", 0, &notes).size() == 1);
-    CHECK(notes.empty()); // it was asked for, or there is but one
+    CHECK(notes.empty()); // a frame was given, or there is only one
     const std::string error = errorOf([&] { parseXyz(bytes, "a.xyz", 4); });
     CHECK(isLineWith(error, "a.xyz: "));
     CHECK(test::contains(error, "frame 4"));
     CHECK(test::contains(error, "3 frames"));
-    // A frame before it that is wrong, and a count that is too small.
+    // A preceding frame that is wrong, and a count that is too small.
     CHECK(isLineWith(errorOf([&] { parseXyz("1\n\nC 0 0 0\nC 1 1 1\n1\n\nC 0 0 0\n", "a.xyz", 2); }), "line 4"));
     CHECK(isLineWith(errorOf([&] { parseXyz("9\n\nC 0 0 0\n1\n\nC 0 0 0\n", "a.xyz", 2); }), "a.xyz: "));
 }
@@ -650,7 +651,7 @@ TEST_CASE("The colours of vertices are taken as sRGB", "[readers]")
     check(parsePly(ply("float", "") + "0 0 0 0 0 0 9\n1 0 0 0.5 0.5 0.5 9\n0 1 0 1 0 0 9\n3 0 1 2\n", "a"));
     check(parseObj("v 0 0 0 0 0 0\nv 1 0 0 0.5 0.5 .5\nv 0 1 0 1 0 0\nf 1 2 3\n", "a", &notes));
     CHECK(notes.empty());
-    // Not of all, not a colour, no colour at all, and those of faces.
+    // Colours that not all vertices have, that are out of range or NaN, and colours of faces.
     CHECK(parseObj("v 0 0 0\nv 1 0 0 0.5 0.5 .5\nv 0 1 0 1 0 0\nf 1 2 3\n", "a.obj", &notes).colors.empty());
     CHECK(parseObj("v 0 0 0 0 0 9\nv 1 0 0 0.5 0.5 .5\nv 0 1 0 1 0 0\nf 1 2 3\n", "b.obj", &notes).colors.empty());
     CHECK(parsePly(ply("float", "") + "0 0 0 0 0 0 9\n1 0 0 nan 0.5 0.5 9\n0 1 0 1 0 0 9\n3 0 1 2\n", "c.ply", &notes)
@@ -665,7 +666,7 @@ TEST_CASE("The colours of vertices are taken as sRGB", "[readers]")
     REQUIRE(notes.size() == 1);
     CHECK(isLineWith(notes[0], "d.ply: the colours of faces"));
     notes.clear();
-    parsePly(asciiMixed(), "a.ply", &notes); // red alone is no colour
+    parsePly(asciiMixed(), "a.ply", &notes); // red alone is not a colour
     parseObj(plainObj, "a.obj", &notes);     // nor is a weight
     CHECK(notes.empty());
 }
@@ -681,7 +682,7 @@ TEST_CASE("A scene takes files by their ending and says which one is wrong", "[r
     CHECK(scene.volumes.size() == 1);
     CHECK(scene.meshes.size() == 2);
     CHECK(scene.spheres.size() == 1);
-    // Each fills the unit cube, and the bounds are hardly larger.
+    // Each file fills the unit cube, and the bounds are hardly larger.
     for (int axis = 0; axis < 3; ++axis) {
         CHECK(example::component(scene.bounds.lo, axis) < 0.0f);
         CHECK(example::component(scene.bounds.lo, axis) > -1e-3f);
@@ -693,7 +694,7 @@ TEST_CASE("A scene takes files by their ending and says which one is wrong", "[r
     CHECK(length(unfitted.bounds.center() - Vec3{100, 200, 300}) < 1e-3f);
 
     for (const std::string name : {"x.ply", "x.obj", "x.xyz", "x_2x2x2_uint8.raw", "x.stl", "x", "m.PLY"}) {
-        INFO(name); // of which none is there
+        INFO(name); // none of these files exists
         CHECK(isLineWith(errorOf([&] { addFile(scene, folder / name, true); }), folder / name));
     }
     for (const std::string name : {"e.ply", "e.obj", "e.xyz", "e_2x2x2_uint8.raw"}) {
@@ -735,7 +736,7 @@ TEST_CASE("A scene says what is not as its files may have meant it", "[readers]"
               "all voxels are 2.5");
     checkNote(notesOf("n_2x2x2_float32.raw", bytesOf<float>({-3, 0, nan, 5, inf, -inf, 2, 1})),
               folder / "n_2x2x2_float32.raw", "not finite: 3; they count as 0");
-    // Those of readers arrive as well.
+    // Notes of readers are passed on as well.
     checkNote(notesOf("u.xyz", "1\n\nXx 0 0 0\n"), folder / "u.xyz", "Xx (1)");
     checkNote(notesOf("u.obj", "v 0 0 0\nv 1 0 0 0.5 0.5 .5\nv 0 1 0 1 0 0\nf 1 2 3\n"), folder / "u.obj", "colours");
     checkNote(notesOf("u.ply", plyHeader("ascii", plainElements + "property uchar red\n")

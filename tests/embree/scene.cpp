@@ -1,4 +1,4 @@
-// What a rank holds of a scene, and what it tells the user of it.
+// What a rank holds of a scene, and which notes it gives the user. Ranks are threads.
 #include "support.hpp"
 #include "together.hpp"
 
@@ -82,7 +82,7 @@ TEST_CASE("The frame of an XYZ file is that of the option", "[scene]")
 
 TEST_CASE("The colours of vertices are in the image, cut or whole", "[scene]")
 {
-    // Red at the left, blue at the right, with more in the file that nothing uses.
+    // Red on the left, blue on the right, and a vertex that no triangle uses.
     Mesh mesh;
     mesh.positions = {{9, 9, 9}, {0, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}};
     mesh.colors = {{0, 1, 0}, {1, 0, 0}, {0, 0, 1}, {0, 0, 1}, {1, 0, 0}};

@@ -1,5 +1,5 @@
-// Meshes and spheres that ranks read together: each reads and keeps a share, and the bricks have, to the bit, what they
-// have when one rank reads all.
+// Meshes and spheres that ranks read together: each rank reads and keeps a share. Bricks are the same, bit for bit, as
+// when a single rank reads everything. Ranks are threads.
 #include "support.hpp"
 #include "together.hpp"
 
@@ -61,7 +61,7 @@ void put(std::string& bytes, T value, bool isBig)
 
 enum class Faces { Triangles, Quads, Both };
 
-// Of each quad two triangles, the quad, or by turns.
+// The faces of the grid: two triangles for each quad, the quad itself, or each in turn.
 std::vector<std::vector<std::uint32_t>> facesOf(const Grid& grid, Faces faces)
 {
     std::vector<std::vector<std::uint32_t>> all;
@@ -121,7 +121,7 @@ std::string plyOf(const Grid& grid, Faces faces, const std::string& format, bool
     return bytes;
 }
 
-// With indices from the front and from behind, and vertices between faces.
+// An OBJ file with positive and negative indices, and with vertices between the faces.
 std::string objOf(const Grid& grid, Faces faces, bool hasColors)
 {
     std::string bytes = "# a sheet\r\n";
@@ -160,7 +160,7 @@ std::string xyzOf(int count, int frames, bool isExtended)
     return bytes;
 }
 
-// All that there is of a primitive, by its number.
+// All values of each primitive, by the primitive's number.
 using Primitives = std::map<std::uint32_t, std::vector<float>>;
 
 void add(Primitives& all, const std::vector<BrickMesh>& meshes, const std::vector<BrickSpheres>& spheres)
@@ -180,7 +180,7 @@ void add(Primitives& all, const std::vector<BrickMesh>& meshes, const std::vecto
         }
 }
 
-// The values that are equal on all ranks.
+// Values that must be equal on all ranks.
 struct Whole {
     std::vector<Box> cells;
     Box bounds, focus;
@@ -197,7 +197,7 @@ Whole wholeOf(const Scene& scene, const Loaders& loaders)
     return {cut.cells(3), scene.bounds, scene.focus().box, scene.focus().radius, scene.notes};
 }
 
-// Whether all ranks have the bricks that one alone has, and none has read much more than its share.
+// Checks that all ranks have the bricks that a single rank has, and that none has read much more than its share.
 void check(const std::string& file, int frame, bool isShared)
 {
     INFO(file);
@@ -216,7 +216,7 @@ void check(const std::string& file, int frame, bool isShared)
         INFO(ranks << " ranks");
         for (const int copies : {ranks == 3 ? 2 : 1, ranks}) {
             const auto results = ofRanks<std::string>(ranks, [&](const Loaders& loaders) {
-                std::string wrong; // said at the end, as the others wait for this rank
+                std::string wrong; // reported at the end, as the others wait for this rank
                 Scene scene;
                 addFile(scene, file, true, frame, loaders);
                 const std::uint64_t most = size + (isShared ? size / static_cast<std::uint64_t>(ranks) : size);
@@ -287,7 +287,7 @@ TEST_CASE("Ranks that read atoms together have the bricks that one alone has", "
             const std::string file = folder.write("a.xyz", xyzOf(4000, frames, isExtended));
             for (int frame = 0; frame <= frames; ++frame) {
                 INFO("frame " << frame);
-                // Other frames are read, too, but not kept.
+                // Other frames are read as well, but not kept.
                 check(file, frame, frames == 1);
             }
         }

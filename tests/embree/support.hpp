@@ -1,4 +1,4 @@
-// What the tests of the bundled renderer share: error texts, and a folder that goes away.
+// Shared by the tests of the bundled renderer: error texts, and a temporary folder.
 #pragma once
 
 #include "catch.hpp"
@@ -12,7 +12,7 @@
 
 namespace test {
 
-// What `function` throws, as text; empty if it throws nothing.
+// The message of the exception that `function` throws, or "" if it throws none.
 template <class Function>
 std::string errorOf(const Function& function)
 {
@@ -26,7 +26,7 @@ std::string errorOf(const Function& function)
 
 inline bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
-// One line that holds `part`.
+// Whether `text` is a single line that contains `part`.
 inline bool isLineWith(const std::string& text, const std::string& part)
 {
     return contains(text, part) && !contains(text, "\n");

@@ -1,4 +1,4 @@
-// Threads that load a scene together, each as a rank.
+// Threads that load a scene together. Each acts as a rank.
 #pragma once
 
 #include <loaders.hpp>
@@ -13,7 +13,7 @@
 
 namespace test {
 
-// Threads that exchange bytes: each gets those of all.
+// Lets threads exchange bytes: each thread gets the bytes of all.
 class Exchange {
 public:
     explicit Exchange(int size) : parts_(static_cast<std::size_t>(size)) {}
@@ -31,7 +31,7 @@ public:
         } else {
             changed_.wait(lock, [&] { return round_ != round; });
         }
-        return all_; // nobody writes the next round's before all have left this one and come again
+        return all_; // no thread writes to the next round before all have returned
     }
 
 private:
@@ -41,7 +41,7 @@ private:
     int there_ = 0, round_ = 0;
 };
 
-// Calls `function` with the loaders of each of `size` ranks at the same time.
+// Calls `function` at the same time on all ranks, with the loaders of each.
 inline void together(int size, const std::function<void(const example::Loaders&)>& function)
 {
     Exchange exchange(size);

@@ -1,6 +1,6 @@
 // check_stats FILE RANKS BYTES
-// Succeeds if statistics of dfb_render are of so many ranks, if their times add up, and if no rank has read more than
-// BYTES of files.
+// Succeeds if the statistics of a run of dfb_render have RANKS ranks, if their times add up, and if no rank has read
+// more than BYTES bytes of files.
 #include <nlohmann/json.hpp>
 
 #include <cmath>

@@ -1,7 +1,6 @@
 // check_trace TRACE STATS
-// Succeeds if a trace of dfb_render agrees with the statistics of the same run in ranks, frames, and bytes sent; if
-// what is drawn in one row lies within or beside each other; and if each arrow begins and ends in a span, and goes
-// forward in time.
+// Succeeds if a trace of dfb_render agrees with the statistics of the same run in ranks, frames and bytes sent; if
+// spans in a row are nested or disjoint; and if each arrow begins and ends in a span and goes forward in time.
 #include <nlohmann/json.hpp>
 
 #include <algorithm>

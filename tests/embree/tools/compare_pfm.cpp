@@ -1,6 +1,6 @@
 // compare_pfm A B TOLERANCE FRACTION
-// Succeeds if two PFM files are of one size and kind, and no more than FRACTION of their pixels differ by more than
-// TOLERANCE in any channel.
+// Succeeds if two PFM files have the same size and kind, and if at most a fraction FRACTION of their pixels differs by
+// more than TOLERANCE in any channel.
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>

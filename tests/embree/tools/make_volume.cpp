@@ -1,4 +1,4 @@
-// dfb_make_volume head|vessels FOLDER: volumes in the likeness of what hospitals have, to look at and to test on.
+// dfb_make_volume head|vessels FOLDER: writes volumes that resemble medical scans, to look at and to test with.
 //
 // head: 128x128x57 voxels of 1:1:2, uint16, 1024 above Hounsfield units: air with noise, skin, muscle, skull, brain.
 // vessels: 128^3, uint8: a tree of bright tubes in noise, less than 1 % of the voxels.

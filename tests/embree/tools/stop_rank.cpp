@@ -1,5 +1,5 @@
-// Linked with the objects of dfb_render: rank 1 stops (SIGSTOP) when it sends for the 100th time, which is between two
-// frames or in the middle of one.
+// Linked with the objects of dfb_render. Rank 1 stops itself (SIGSTOP) at its 100th call of MPI_Isend, which is between
+// two frames or in the middle of one.
 #include <mpi.h>
 
 #include <atomic>
