@@ -208,7 +208,7 @@ void checkCuts(const Scene& scene, const example::RenderSettings& settings)
     }
 }
 
-// Two squares of each kind, with faces exactly on the planes at which a scene of [-2, 2]^3 is cut in 8.
+// Three squares, exactly on the planes at which a scene of [-2, 2]^3 is cut in 8.
 example::Mesh walls()
 {
     example::Mesh mesh;

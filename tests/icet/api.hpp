@@ -1,4 +1,4 @@
-// The functions of an IceT in a shared library, so that one program can have two of them.
+// The functions of an IceT in a shared library, so that one program can use two of them.
 #pragma once
 
 #include <IceT.h>

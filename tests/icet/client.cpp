@@ -1,13 +1,14 @@
-// A client that links libdfb_icet in place of IceT, and what it is told when something is wrong:
-//   mpirun -n 3 test_icet_client errors      calls that are wrong, on one rank or on all
-//   mpirun -n 3 test_icet_client moves       tiles that change their size and rank, frame by frame
+// A client that links libdfb_icet in place of IceT. Checks the errors that it gets:
+//   mpirun -n 3 test_icet_client errors      wrong calls, on one rank or on all
+//   mpirun -n 3 test_icet_client moves       tiles that change their size and rank from frame to frame
 //   mpirun -n 2 test_icet_client differs     ranks that have set different tiles
 //   mpirun -n 3 test_icet_client absent      a rank that does not call (DFB_ICET_TIMEOUT=1)
-//   mpirun -n 3 test_icet_client stopped     a rank that hangs and goes on later (DFB_ICET_TIMEOUT=1)
+//   mpirun -n 3 test_icet_client stopped     a rank that hangs and continues later (DFB_ICET_TIMEOUT=1)
 //   mpirun -n 3 test_icet_client killed      a rank that dies; prints "all were told", then the launcher may end the
 //                                            job
 //   mpirun -n 2 test_icet_client finalised   a context that outlives MPI
-// With "multiple" as the second word at MPI_THREAD_MULTIPLE, else at MPI_THREAD_SINGLE. Returns 0 if all is well.
+// The second word "multiple" initialises MPI at MPI_THREAD_MULTIPLE, otherwise at MPI_THREAD_SINGLE. Returns 0 if all
+// is well.
 #include <IceT.h>
 #include <mpi.h>
 
@@ -65,7 +66,7 @@ IceTContext makeContext()
     return context;
 }
 
-// Each rank has a column of its colour, the nearer the higher its number.
+// A picture whose columns from `rank` on have the rank's colour. Ranks with higher numbers are nearer.
 struct Picture {
     Picture(int pictureWidth, int pictureHeight) : width(pictureWidth), height(pictureHeight)
     {
@@ -171,7 +172,7 @@ void trySettings()
     icetGetError();
 }
 
-// The left half of the wall, as a box.
+// The bounds are a box that covers the left half of the wall.
 void tryBounds()
 {
     icetBoundingBoxf(-1, 0, -1, 1, 0, 0);
@@ -324,7 +325,8 @@ void tryAbsence()
     icetDestroyContext(context);
 }
 
-// The others are told in time, whether the lost rank comes back or not. `launched`: the process that the launcher sees.
+// The other ranks get their error in time, whether the lost rank comes back or not. `launched` is the process that the
+// launcher started.
 void tryLoss(int signal, int launched)
 {
     IceTContext context = makeContext();
@@ -336,7 +338,7 @@ void tryLoss(int signal, int launched)
     MPI_Comm others;
     MPI_Comm_split(MPI_COMM_WORLD, rank == victim ? MPI_UNDEFINED : 0, rank, &others);
     if (rank == victim) {
-        raise(signal); // the rest is for one that comes back
+        raise(signal); // what follows is for a rank that comes back
     } else {
         const auto before = std::chrono::steady_clock::now();
         expect(icetImageIsNull(Picture(40, 30).composite()), "a picture without the lost rank");
@@ -344,7 +346,7 @@ void tryLoss(int signal, int launched)
         expect(std::chrono::steady_clock::now() - before < std::chrono::seconds(15), "it takes long");
         MPI_Barrier(others);
     }
-    if (signal == SIGKILL) { // no end of MPI is orderly any more
+    if (signal == SIGKILL) { // MPI can no longer be finalised in order
         if (rank == 0) {
             int all = failures, own = failures;
             MPI_Reduce(&own, &all, 1, MPI_INT, MPI_SUM, 0, others);
@@ -387,7 +389,7 @@ int main(int count, char** words)
 {
     const std::string what = count > 1 ? words[1] : "";
     const bool isMultiple = count > 2 && words[2] == std::string("multiple");
-    // Launchers end a job as soon as a process dies. Here the rank is another process than the one that they see.
+    // Launchers end a job as soon as a process dies. So the rank is a child of the process that the launcher started.
     const int launched = getpid();
     if (what == "killed") {
         int status = 0;

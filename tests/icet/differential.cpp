@@ -1,11 +1,11 @@
-// Holds libdfb_icet against IceT and against an exact reference. Both are loaded and get the same calls at random:
+// Compares libdfb_icet with IceT and with an exact reference. Both libraries are loaded and get the same random calls:
 //   mpirun -n 3 test_icet_differential IceTCore.so libdfb_icet.so [--cases N] [--seed S] [--only CASE] [--multiple]
-// A case is a frame in one of three contexts, which keep what they were told. --multiple: at MPI_THREAD_MULTIPLE, else
-// at MPI_THREAD_SINGLE. Returns 0 if all is well.
-//   nearest: colours and depths equal the reference bit for bit, and IceT's. Of equal depths the lowest rank's colour
-//            wins; IceT's winner depends on its strategy, so it is not asked there.
-//   blended: bytes are within half a level of the reference, floats within their rounding. IceT's are off by up to a
-//            level for each rank, and it drops light without opacity.
+// A case is a frame in one of three contexts, which keep their settings. --multiple initialises MPI at
+// MPI_THREAD_MULTIPLE, otherwise it is at MPI_THREAD_SINGLE. Returns 0 if all is well.
+//   nearest: colours and depths equal the reference and IceT's bit for bit. Of equal depths the lowest rank's colour
+//            wins. IceT's winner depends on its strategy, so it is not compared there.
+//   blended: bytes are within half a level of the reference, floats within their rounding. IceT's may be off by a
+//            level for each rank, and IceT drops light without opacity.
 #include "reference.hpp"
 
 #include "icet.hpp"
@@ -28,7 +28,7 @@ struct View {
     Matrix projection{}, modelview{};
     std::array<float, 4> background{};
     bool hasLimits = false;
-    Rect limits; // outside of them a pre-rendered image has garbage
+    Rect limits; // a pre-rendered image has garbage outside of them
 };
 
 int rankOf(MPI_Comm comm)
@@ -84,18 +84,18 @@ struct Pixels {
     std::vector<float> floats, depth;
 };
 
-// The draw callback's knowledge of the frame, and the calls it got.
+// What the draw callback needs to know of the frame, and the calls that it got.
 struct Drawing {
     const Api* api = nullptr;
     const Setup* setup = nullptr;
     const View* view = nullptr;
     const Picture* picture = nullptr;
-    std::vector<Rect> asked; // on the wall
+    std::vector<Rect> asked; // rectangles of the wall that were drawn
     int empty = 0;
     std::string wrong;
 } drawing;
 
-// The window that was put in front of a projection: P' = W P, where W scales and moves x and y.
+// Finds the window that was put in front of a projection: P' = W P, where W scales and moves x and y.
 bool findWindow(const IceTDouble* projected, const Setup& setup, const Matrix& projection, Rect& window)
 {
     const Rect wall = setup.wall();
@@ -103,7 +103,7 @@ bool findWindow(const IceTDouble* projected, const Setup& setup, const Matrix& p
               shown[2] = {window.width, window.height};
     int found[2] = {0, 0};
     for (std::size_t row = 0; row < 2; ++row) {
-        // scale * a + offset * b for the two columns that tell best
+        // Solves for scale * a + offset * b with the two columns that determine it best.
         double best = 0, scale = 0, offset = 0;
         for (std::size_t i = 0; i < 4; ++i)
             for (std::size_t j = 0; j < i; ++j) {
@@ -186,7 +186,7 @@ void apply(const Api& api, const Setup& setup, int rank, IceTEnum strategy, IceT
     else if (const auto& box = setup.boxes[static_cast<std::size_t>(rank)]; rank % 2 == 0)
         api.icetBoundingBoxd(box[0], box[1], box[2], box[3], box[4], box[5]);
     else {
-        std::vector<float> vertices; // with a gap after each
+        std::vector<float> vertices; // with a gap after each vertex
         for (int i = 0; i < 8; ++i)
             for (const std::size_t c :
                  {std::size_t(i / 4), std::size_t(2 + i / 2 % 2), std::size_t(4 + i % 2), std::size_t(0)})
@@ -218,7 +218,7 @@ std::vector<IceTInt> integers(const Api& api, IceTEnum name, std::size_t most)
     return values;
 }
 
-// Reads what came out, by all functions that do, and writes to what a client may change.
+// Reads the result with all functions that can, and writes to everything that a client may change.
 void read(const Api& api, IceTImage image, Outcome& out)
 {
     out.isNull = api.icetImageIsNull(image);
@@ -304,12 +304,12 @@ std::vector<std::array<double, 6>> drawBoxes(Random& random, int ranks)
     for (int rank = 0; rank < ranks; ++rank) {
         std::array<double, 6> box{};
         for (std::size_t c = 0; c < 3; ++c) {
-            // numbers that are the same as floats
+            // numbers that floats represent exactly
             box[2 * c] = pick(random, -64, 64) / 64.0;
             box[2 * c + 1] = box[2 * c] + pick(random, 0, 64) / 64.0;
         }
         if (chance(random, 0.1))
-            box = {FLT_MAX, FLT_MAX, 0, 0, 0, 0}; // how ParaView says that there is nothing
+            box = {FLT_MAX, FLT_MAX, 0, 0, 0, 0}; // how ParaView says that it has nothing
         boxes.push_back(box);
     }
     return boxes;
@@ -320,7 +320,7 @@ std::vector<IceTInt> drawOrder(Random& random, const std::vector<int>& groups)
     std::vector<IceTInt> order(groups.size());
     std::iota(order.begin(), order.end(), 0);
     std::shuffle(order.begin(), order.end(), random);
-    // ranks with the same data in a row: they share out the pixels, so their places must not matter
+    // Ranks with the same data follow each other. They share out the pixels, so their order must not matter.
     std::vector<int> first(groups.size(), -1);
     for (std::size_t i = 0; i < order.size(); ++i)
         if (int& place = first[static_cast<std::size_t>(groups[static_cast<std::size_t>(order[i])])]; place < 0)
@@ -380,7 +380,7 @@ View drawView(Random& shared, Random& own, const Setup& setup)
     view.modelview[13] = real(shared, -0.3, 0.3);
     view.modelview[0] = std::cos(0.3), view.modelview[5] = view.modelview[0];
     view.modelview[1] = std::sin(0.3), view.modelview[4] = -view.modelview[1];
-    if (chance(shared, 0.5)) { // a frustum; geometry also lies behind the eye
+    if (chance(shared, 0.5)) { // a frustum; some geometry lies behind the eye
         const double nearest = 0.25, farthest = 8;
         view.projection[0] = real(shared, 0.5, 2), view.projection[5] = real(shared, 0.5, 2);
         view.projection[8] = real(shared, -0.2, 0.2);
@@ -402,9 +402,9 @@ View drawView(Random& shared, Random& own, const Setup& setup)
     return view;
 }
 
-// Whether IceT does what it says, as far as its sources tell. Its window for all tiles is overwritten when another is
-// rendered. It forgets limits that begin left of or below the bounds, or if ranks have the same data, whose shares of
-// overlapping tiles it counts twice.
+// Whether IceT does what it documents, as far as its sources tell. Its window for all tiles is overwritten when another
+// tile is rendered. It forgets limits that begin left of or below the bounds. If ranks have the same data, it forgets
+// limits, too, and counts their shares of overlapping tiles twice.
 bool isIceTRight(const Setup& setup, const View& view)
 {
     if (view.hasLimits && (!setup.boxes.empty() || setup.replicates()))
@@ -430,7 +430,7 @@ public:
     Run(const Run&) = delete;
     Run& operator=(const Run&) = delete;
 
-    // Returns whether all is well on this rank.
+    // Returns whether this rank found no fault.
     bool check(std::uint64_t seed, int number)
     {
         Random shared(seed * 1000003 + static_cast<std::uint64_t>(number));
@@ -539,7 +539,7 @@ private:
         expect(dfb_.icetGetError() == ICET_NO_ERROR, "a query fails");
     }
 
-    // The calls that the client got.
+    // Compares the calls that the draw callback got.
     void compareCalls(const Setup& setup, const View& view, const Outcome& ours, const Outcome& theirs)
     {
         expect(ours.error == ICET_NO_ERROR, "there is an error");
@@ -560,7 +560,7 @@ private:
         expect(ours.empty == theirs.empty, "other empty images are asked for");
     }
 
-    // Of the ranks, or of the groups of ranks with the same data.
+    // The layers of all ranks. Of a group of ranks with the same data, only the first rank's counts.
     template <class PictureOf>
     std::vector<Layer> layers(const Setup& setup, const View& view, const Outcome& ours, const PictureOf& pictureOf)
     {
@@ -578,7 +578,7 @@ private:
             const auto& groups = setup.groups;
             const auto first = std::find(groups.begin(), groups.end(), groups[static_cast<std::size_t>(rank)]);
             if (first - groups.begin() < rank)
-                layers.back().part = {}; // counted already
+                layers.back().part = {}; // the group is counted already
         }
         return layers;
     }

@@ -1,8 +1,8 @@
-// Preloaded before IceT, or before libdfb_icet, whichever composites. Adds to $DFB_PROBE/times how long each frame
-// takes, from the moment when the last rank has rendered until rank 0 has the picture. Ranks that render for different
-// times wait for each other, and on a machine with fewer cores than ranks even more: that is no time of who composites.
-// All ranks have one clock, so they must be on one machine. While there is a file $DFB_PROBE/wanted it also writes what
-// goes into a frame that is blended, to input_RANK beside it, and what comes out, to output; the last frame stays.
+// Preloaded before IceT or libdfb_icet, whichever composites. Appends to $DFB_PROBE/times how long each frame takes
+// from the moment when the last rank has rendered until rank 0 has the picture. This leaves out the time for which
+// ranks wait for slower ranks to render, which does not depend on the compositor. All ranks must be on one machine, as
+// their clocks are compared. While the file $DFB_PROBE/wanted exists, it also writes the inputs of each blended frame
+// to input_RANK beside that file, and the result to output; the files of the last frame stay.
 //
 //   mpirun -n 3 env DFB_PROBE=FOLDER LD_PRELOAD="paraview_probe.so libdfb_icet.so" pvbatch movie.py
 #include <IceT.h>
@@ -17,7 +17,7 @@
 
 namespace {
 
-// The function of this name behind this library.
+// The function of this name in the next library in search order.
 template <class Function>
 Function* behind(const char* name, Function*)
 {
@@ -28,7 +28,7 @@ Function* behind(const char* name, Function*)
 struct Call {
     IceTDrawCallbackType draw = nullptr;
     IceTInt order[64] = {};
-    double renderedMs = 0; // when this rank had rendered
+    double renderedMs = 0; // time at which this rank had rendered
 } call;
 
 double msNow()
@@ -50,7 +50,7 @@ std::FILE* open(const std::string& name, const char* how)
     return folder ? std::fopen((folder + ("/" + name)).c_str(), how) : nullptr;
 }
 
-// The place of its rank, its size, the part that counts (x, y, width, height), and 8-bit RGBA.
+// Writes the place of the rank, its size, the valid part (x, y, width, height), and 8-bit RGBA.
 void write(const std::string& name, IceTImage image, IceTInt place, const IceTInt* part)
 {
     static const auto width = DFB_BEHIND(icetImageGetWidth), height = DFB_BEHIND(icetImageGetHeight);
@@ -102,7 +102,7 @@ extern "C" IceTImage icetDrawFrame(const IceTDouble* projection, const IceTDoubl
 {
     static const auto drawFrame = DFB_BEHIND(icetDrawFrame);
     static const auto isNull = DFB_BEHIND(icetImageIsNull);
-    call.renderedMs = msNow(); // if it has nothing to render
+    call.renderedMs = msNow(); // for ranks that have nothing to render
     const IceTImage image = drawFrame(projection, modelview, background);
     const double endMs = msNow();
     double lastMs = 0;

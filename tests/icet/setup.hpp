@@ -1,4 +1,4 @@
-// Settings of a client, at random, and the images that its ranks have.
+// Random settings of a client, and the images of its ranks.
 #pragma once
 
 #include "api.hpp"

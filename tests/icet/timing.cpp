@@ -1,8 +1,8 @@
-// How long icetCompositeImage takes, of IceT by each of its strategies and of libdfb_icet, frame by frame in turn:
+// Measures icetCompositeImage of IceT, with each of its strategies, and of libdfb_icet, in turn for each frame:
 //   mpirun -n 4 test_icet_timing IceTCore.so libdfb_icet.so [--frames N] [--size PIXELS]
-// Prints the median over the frames of the time from a barrier until the last rank returns, and of the processor time
-// of all ranks, but for what IceT's ranks spend in giving up their time slices while they wait. On a machine that does
-// other work, too, it is the processor time that says which is cheaper.
+// Prints medians over the frames: of the time from a barrier until the last rank returns, and of the processor time of
+// all ranks, without what IceT's ranks spend in sched_yield() while they wait. On a machine that does other work,
+// compare processor times.
 //   dense:  each rank has pixels everywhere
 //   bricks: each rank has pixels in a rectangle of its own, of 1/ranks of the picture and half as much around it
 #include "setup.hpp"
@@ -28,7 +28,7 @@ struct Images {
     IceTInt valid[4] = {0, 0, 0, 0};
 };
 
-// A smooth layer, a third opaque: what a rendered image looks like to a compositor.
+// A smooth layer, a third of which is opaque, as rendered images often are.
 Images makeImages(int size, int rank, int ranks, bool isBricks)
 {
     Images images;
@@ -98,7 +98,7 @@ struct Client {
     double cpuMs() const { return median(cpuSeconds); }
 };
 
-// Of this process, without what it spends in sched_yield() while it waits.
+// Processor time of this process, without what it spends in sched_yield() while it waits.
 double cpuSeconds()
 {
     rusage usage{};
@@ -131,7 +131,7 @@ void set(const Client& client, Way way, int size)
     api.icetSingleImageStrategy(client.strategy.single);
 }
 
-// Adds the longest time of a rank, and the processor time of all.
+// Notes the longest time of any rank, and the processor time of all ranks.
 void timeFrame(Client& client, Way way, const Images& images, bool counts)
 {
     constexpr IceTDouble identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
@@ -185,7 +185,7 @@ int run(int count, char** words)
                 client.seconds.clear();
                 client.cpuSeconds.clear();
             }
-            for (int frame = -2; frame < frames; ++frame) // the first two make memory
+            for (int frame = -2; frame < frames; ++frame) // the first two frames allocate memory
                 for (Client& client : clients)
                     timeFrame(client, way, images, frame >= 0);
             const auto best =
