@@ -93,7 +93,7 @@ TEST_CASE("No two threads hold the same block", "[memory]")
     for (std::thread& thread : threads)
         thread.join();
     CHECK(spoilt == 0);
-    CHECK(pool->peakBytes() <= 4 * (256 + 384)); // what was held at once, not what was asked for in all
+    CHECK(pool->peakBytes() <= 4 * (256 + 384)); // what was held at once, not the sum
 }
 
 } // namespace buffer_cases

@@ -1,4 +1,5 @@
-// DependencyTracker: every order in which the inputs of small trees can arrive, and every way to get a tree wrong.
+// DependencyTracker: every order in which the inputs of small trees can arrive, and every way in which a tree can be
+// wrong.
 #include "catch.hpp"
 
 #include <dfb/dependency_tracker.hpp>
@@ -51,7 +52,7 @@ const std::vector<Shape>& shapes()
          1,
          {{0, 9, 0, 2}, {1, 0, 0, 3}, {1, 1, 0, 0}, {2, 0, 0, 0}, {2, 1, 0, 1}, {2, 2, 0, 0}, {3, 5, 0, 0}}},
         {"wide in the middle", 1, {{0, 9, 0, 1}, {1, 0, 0, 3}, {2, 1, 0, 0}, {2, 2, 0, 1}, {2, 3, 0, 0}, {3, 4, 0, 0}}},
-        // Members count together: 1 announces nothing of its own, 0 announces 1's children too.
+        // A generation's announcements count together: 1 announces nothing itself, and 0 announces 1's children, too.
         {"children announced by another's parent",
          1,
          {{0, 9, 0, 2}, {1, 0, 0, 4}, {1, 1, 0, 0}, {2, 0, 0, 0}, {2, 0, 1, 0}, {2, 1, 0, 0}, {2, 1, 1, 0}}},
@@ -75,10 +76,10 @@ void arrive(dfb::DependencyTracker& tracker, const Input& i)
     tracker.arrive(i.generation, i.source, i.part, i.children);
 }
 
-// The error of the first arrival that throws, if any does; `complete` is what the tracker said after the last one.
+// The error of the first arrival that throws, if any. `complete` is the tracker's state after the last arrival.
 struct Run {
     std::optional<dfb::ErrorInfo> error;
-    std::size_t arrivals = 0; // that did not throw
+    std::size_t arrivals = 0; // arrivals that did not throw
     bool complete = false;
 };
 
@@ -99,7 +100,7 @@ Run run(const Tree& tree, const std::vector<std::size_t>& order)
     return result;
 }
 
-// The most memory that this process has had.
+// The peak memory of this process.
 long peakKiB()
 {
     rusage usage{};
@@ -117,7 +118,7 @@ TEST_CASE("A tree is complete at its last arrival and not before, in every order
         dfb::DependencyTracker tracker;
         forAllOrders(shape.inputs.size(), [&](const std::vector<std::size_t>& order) {
             ++orders;
-            tracker.reset(shape.rootCount); // reused as the framebuffer reuses it
+            tracker.reset(shape.rootCount); // reused, as the framebuffer does
             bool fine = !tracker.complete() && tracker.missing() && tracker.arrivedCount() == 0;
             for (std::size_t k = 0; k < order.size(); ++k) {
                 arrive(tracker, shape.inputs[order[k]]);
@@ -190,7 +191,7 @@ TEST_CASE("One leaf too many is an error in every order", "[tracker]")
                 r.error && std::any_of(tree.begin(), tree.end(), [&](const Input& i) {
                     return i.generation == leaves && static_cast<std::int64_t>(i.source) == r.error->source;
                 });
-            // Who is the one too many cannot be told; but it is one of that generation.
+            // Which input is the surplus one cannot be told, but it is one of that generation.
             if (!isLeaf || r.error->kind != dfb::ErrorKind::TooManyInputs || r.error->generation != leaves
                 || r.error->expected != expected || r.error->got != expected + 1) {
                 ++wrong;
@@ -211,12 +212,13 @@ TEST_CASE("One inner input too many never passes unnoticed", "[tracker]")
             for (int generation = 0; generation < 3; ++generation) {
                 Tree tree = shape.inputs;
                 tree.push_back({generation, 77, 0, children});
-                // With its announced children it would be another valid tree if its generation had the room; it has
-                // not.
+                // With its announced children this would be another valid tree if its generation had room for it, but
+                // it has not.
                 std::size_t unnoticed = 0;
                 forAllOrders(tree.size(), [&](const std::vector<std::size_t>& order) {
                     const Run r = run(tree, order);
-                    // Counts alone decide: an error, or, where it announced more, a tree that waits for them.
+                    // Only counts decide: there is an error, or, if the surplus input announced more, the tree waits
+                    // for them.
                     const bool noticed = r.error ? r.error->kind == dfb::ErrorKind::TooManyInputs
                                                        || r.error->kind == dfb::ErrorKind::UnannouncedInput
                                                  : !r.complete;
@@ -305,7 +307,7 @@ TEST_CASE("Negative children and impossible generations are errors at once", "[t
     CHECK(far.got == dfb::DependencyTracker::maxGenerations);
     CHECK(far.source == 5);
 
-    // Sums of children beyond 32 bits do not wrap.
+    // Sums of children above 32 bits do not wrap around.
     dfb::DependencyTracker tracker;
     tracker.arrive(0, 0, 0, 2);
     tracker.arrive(1, 0, 0, 2147483647);
@@ -322,7 +324,7 @@ TEST_CASE("Generations may come in any order, however far from each other", "[tr
     std::iota(order.begin(), order.end(), 0);
     const auto fine = [&](bool isClosed) {
         dfb::DependencyTracker tracker;
-        for (int run = 0; run < 2; ++run) { // reused as the framebuffer reuses it
+        for (int run = 0; run < 2; ++run) { // reused, as the framebuffer does
             tracker.reset();
             for (std::size_t i = 0; i < order.size(); ++i) {
                 if (tracker.complete())
@@ -353,7 +355,7 @@ TEST_CASE("An input that is far from all others takes no memory for those betwee
     const long before = peakKiB();
     for (auto& tracker : trackers)
         tracker.arrive(last, 7, 0, 1);
-    CHECK(peakKiB() - before < 50000); // a third of what they would take
+    CHECK(peakKiB() - before < 50000); // a third of what they would take otherwise
     for (auto& tracker : trackers) {
         try {
             tracker.arrive(0, 1, 0, 0);
@@ -370,7 +372,7 @@ TEST_CASE("An input that is far from all others takes no memory for those betwee
 TEST_CASE("Declared inputs: any order of declaration and arrivals completes at the last", "[tracker]")
 {
     const Names declared{{3, 0, 5}, {1, 0}, {1, 1}, {8, 0}};
-    // Number 4 stands for the declaration.
+    // Number 4 is the declaration.
     std::size_t wrong = 0;
     forAllOrders(5, [&](const std::vector<std::size_t>& order) {
         dfb::DependencyTracker tracker;
@@ -405,7 +407,7 @@ TEST_CASE("Declared inputs: any order of declaration and arrivals completes at t
 TEST_CASE("Declared inputs: what was not declared, declared twice, or comes twice", "[tracker]")
 {
     const Names declared{{1, 0}, {2, 0}};
-    // All orders of: declaration (0), the two declared inputs (1, 2), a culprit (3).
+    // All orders of the declaration (0), the two declared inputs (1, 2) and the culprit (3).
     const auto errors = [&](const Input& culprit) {
         std::vector<dfb::ErrorInfo> result;
         forAllOrders(4, [&](const std::vector<std::size_t>& order) {
@@ -438,7 +440,7 @@ TEST_CASE("Declared inputs: what was not declared, declared twice, or comes twic
     CHECK(allAre({1, 2, 1, 0}, dfb::ErrorKind::UnannouncedInput, 0, 1)); // a part that nobody declared
     CHECK(allAre({1, 2, 0, 0}, dfb::ErrorKind::DuplicateInput, 1, 2));
     CHECK(allAre({2, 2, 0, 0}, dfb::ErrorKind::UnannouncedInput, 0, 1)); // a generation that nobody announced
-    // The root is the declaration. A second root that comes first closes the tree, and then the next input is blamed.
+    // The declaration is the root. If a second root comes first it closes the tree, and the next input is blamed.
     const auto roots = errors({0, 2, 0, 0});
     CHECK(roots.size() == 24);
     CHECK(std::all_of(roots.begin(), roots.end(), [](const dfb::ErrorInfo& e) {

@@ -1,4 +1,4 @@
-// ErrorInfo: what its one line says of ranks, and that all of it travels.
+// ErrorInfo: how its one-line description names ranks, and that all of it can be sent.
 #include "catch.hpp"
 
 #include <dfb/comm/message.hpp>
@@ -29,13 +29,13 @@ TEST_CASE("A rank that only noticed does not read like the culprit", "[error]")
     const auto text = [](Kind kind, int rank, int from, int generation = -1) {
         return infoOf(kind, rank, from, generation).describe();
     };
-    // Where it went wrong.
+    // Errors for which `rank` is where it went wrong.
     CHECK(text(Kind::UserCode, 3, -1) == "dfb: exception in user code: rank 3: so it is");
     CHECK(text(Kind::UserCode, 3, 1) == "dfb: exception in user code: rank 3, in a message from rank 1: so it is");
     CHECK(text(Kind::Cancelled, 3, -1) == "dfb: frame cancelled: rank 3: so it is");
     CHECK(text(Kind::InvalidArgument, 3, -1) == "dfb: invalid argument: rank 3: so it is");
     CHECK(text(Kind::Transport, 3, -1) == "dfb: transport failure: rank 3: so it is");
-    // Where it was noticed.
+    // Errors for which `rank` only noticed it.
     CHECK(text(Kind::TimedOut, 3, -1) == "dfb: timed out: noticed by rank 3: so it is");
     CHECK(text(Kind::TimedOut, 3, 1) == "dfb: timed out: noticed by rank 3, waiting for rank 1: so it is");
     CHECK(text(Kind::TimedOut, 3, 1, 2)

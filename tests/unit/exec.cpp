@@ -1,4 +1,4 @@
-// Executors: loops and tasks on workers.
+// Executors: loops and tasks on worker threads.
 #include "catch.hpp"
 
 #include <dfb/exec.hpp>
@@ -86,7 +86,7 @@ void check(Arguments... threads)
             executor.parallelFor(10, [&](std::size_t) { ++calls; });
             CHECK(calls == 10);
         }
-        // From within a nested loop too.
+        // An exception must come out of a nested loop, too.
         CHECK_THROWS_AS(executor.parallelFor(3,
                                              [&](std::size_t) {
                                                  executor.parallelFor(3, [](std::size_t i) {
@@ -171,7 +171,7 @@ TEST_CASE("ThreadExecutor has the workers it says, and they work at once", "[exe
 {
     CHECK(dfb::ThreadExecutor(3).concurrency() == 3);
     dfb::ThreadExecutor executor(3);
-    // Each body waits for the others: with fewer workers this would not end.
+    // Each body waits for the others, which would never end with fewer workers.
     std::mutex mutex;
     std::condition_variable changed;
     int arrived = 0;
@@ -205,7 +205,7 @@ TEST_CASE("While the workers of a ThreadExecutor rest, the threads that call do 
     executor.submit(note);
     executor.submit(note);
     executor.rest(false);
-    CHECK(!executor.hasWorkers()); // one is left that wants them to rest
+    CHECK(!executor.hasWorkers()); // one more caller still wants them to rest
     executor.rest(false);
     CHECK(executor.hasWorkers());
     std::unique_lock<std::mutex> lock(mutex);
@@ -239,7 +239,7 @@ TEST_CASE("Processors: their number, whether two sets meet, and what each of sev
         low.add(i);
         both.add(i);
     }
-    for (const int i : {64, 66, 127, 1023}) { // the same places of other words
+    for (const int i : {64, 66, 127, 1023}) { // the same bits of other words
         high.add(i);
         both.add(i);
     }

@@ -1,4 +1,4 @@
-// Image: rounding to the output formats, exactly; and what an image lets one see.
+// Image: exact rounding to the output formats, and access to the channels of an image.
 #include "catch.hpp"
 
 #include <dfb/image.hpp>
@@ -23,7 +23,7 @@ namespace image_cases {
 
 namespace {
 
-// `count` neighbours of a value on each side, and the value.
+// The value, and `count` neighbours on each side.
 template <class Real>
 std::vector<Real> neighbourhood(Real value, int count)
 {
@@ -36,7 +36,7 @@ std::vector<Real> neighbourhood(Real value, int count)
     return result;
 }
 
-// The double or float nearest to where sRGB level `level` becomes the next.
+// The double or float nearest to the threshold between sRGB level `level` and the next one.
 template <class Real>
 Real srgbThreshold(int level)
 {
@@ -74,8 +74,8 @@ TEST_CASE("toUnorm8 is exact rounding of every float, ties to even", "[image]")
 
 TEST_CASE("toUnorm8 is exact rounding of doubles, and the double nearest to a tie counts as the tie", "[image]")
 {
-    // An exact result can be a tie that is not a double, as 1/6 = 42.5 / 255 from 3 passes. It is known to half an ulp,
-    // and must round to even all the same. The next 2 doubles may go with it, or to their own side.
+    // An exact result can be a tie that is not a double, such as 1/6 = 42.5 / 255 after 3 passes. It is known to half
+    // an ulp, and must still round to even. The next 2 doubles may round like it, or to their own side.
     std::size_t wrong = 0;
     for (int k = 0; k < 255; ++k) {
         const double tie = (k + 0.5) / 255;
@@ -173,8 +173,8 @@ TEST_CASE("convertPixels writes each format", "[image]")
 
 namespace {
 
-// How many bytes differ between pixels stored past the cache, with the rest converted, and pixels converted, at a place
-// `first` pixels behind the beginning of a cache line; those around them must stay.
+// Number of bytes that differ between streamPixels(), with the remainder converted, and convertPixels(). Pixels begin
+// `first` pixels behind the start of a cache line; bytes around them must not change.
 template <class Real>
 int wrongPastCache(int first, int count)
 {
@@ -261,7 +261,7 @@ TEST_CASE("sRGB levels of values that a double cannot tell from a boundary", "[i
 
 } // namespace image_cases
 
-// Dither: levels stay, no value is off by a level, means are right, colour does not exceed alpha.
+// Dither: exact levels stay, no value is off by a level, means are right, and colour does not exceed alpha.
 namespace dither_cases {
 
 namespace {
@@ -270,7 +270,7 @@ using dfb::OutputFormat;
 
 constexpr OutputFormat formats[] = {OutputFormat::RGBA8, OutputFormat::SRGBA8};
 
-// The linear value of a level, which need not be whole.
+// The linear value of a level, which may be fractional.
 double lightOf(OutputFormat format, double level)
 {
     const double s = level / 255;
@@ -294,7 +294,7 @@ std::array<int, 4> pixel(OutputFormat format, Real color, Real alpha, int x, int
     return {static_cast<int>(out[0]), static_cast<int>(out[1]), static_cast<int>(out[2]), static_cast<int>(out[3])};
 }
 
-// Floats from 0 to 1: in equal steps, and `count` neighbours of each level and of each place where one pixel changes.
+// Floats from 0 to 1 in equal steps, and `count` neighbours of each level and of each value at which one pixel changes.
 std::vector<float> values(OutputFormat format, int steps, int count)
 {
     std::vector<float> result;
@@ -311,7 +311,7 @@ std::vector<float> values(OutputFormat format, int steps, int count)
     return result;
 }
 
-// Of a constant colour over 8x8 pixels from (x, y) on: its levels and their light.
+// The mean level and the mean light of a constant colour over 8x8 pixels from (x, y) on.
 struct Mean {
     double level = 0, light = 0;
 };
@@ -374,7 +374,7 @@ TEST_CASE("What is a level stays it at every place, ends clamp, NaN is 0", "[dit
 
 TEST_CASE("No value is off by a level or more, and thresholds choose between neighbours", "[dither]")
 {
-    // The lowest and the highest threshold; the others are in between.
+    // The lowest and the highest threshold. All others are in between.
     int wrong = 0, up = 0;
     for (const OutputFormat format : formats)
         for (const float value : values(format, 1 << 16, 3)) {
@@ -405,7 +405,7 @@ TEST_CASE("The mean over any 8x8 pixels is the value, in levels and in light", "
         }
     CHECK(worstLevel <= 1.0 / 64);
     CHECK(worstLight <= 1.0001 / 128);
-    CHECK(worstLight > 0.9 / 128); // or nothing was dithered, to finer steps than there are
+    CHECK(worstLight > 0.9 / 128); // otherwise nothing was dithered
 }
 
 TEST_CASE("Alpha is rounded, and a colour up to alpha does not exceed it", "[dither]")

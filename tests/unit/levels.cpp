@@ -1,5 +1,5 @@
-// Levels: rows that are converted many values at a time have the bytes that values alone have, and what is said to be
-// far from a tie is.
+// Levels: rows that are converted many values at a time have the same bytes as single values, and values that are said
+// to be far from a tie are far from it.
 #include "catch.hpp"
 
 #include <dfb/image.hpp>
@@ -24,7 +24,7 @@ struct Levels {
     double farthest = 0;
 };
 
-// The level by search, and whether a neighbour is within 2^-35 of the value.
+// Finds the level by search. `isNear`: whether a threshold is within 2^-35 of the value.
 std::uint8_t searchedSrgb8(double value, bool& isNear)
 {
     static const auto t = [] {
@@ -38,13 +38,13 @@ std::uint8_t searchedSrgb8(double value, bool& isNear)
     }();
     const std::ptrdiff_t level = value >= t.front() ? std::upper_bound(t.begin(), t.end(), value) - t.begin() : 0;
     const auto at = [&](std::ptrdiff_t k) { return t[static_cast<std::size_t>(k)]; };
-    value = std::min(value, 2.0); // infinity is far from any
+    value = std::min(value, 2.0); // infinity is far from any threshold
     isNear = (level > 0 && value - at(level - 1) <= 0x1p-35 * value)
              || (level < 255 && at(level) - value <= 0x1p-35 * at(level));
     return static_cast<std::uint8_t>(level);
 }
 
-// One value at a time.
+// Converts one value at a time.
 template <class Real>
 Levels oneByOne(const Real* rgba, int count, OutputFormat format)
 {
@@ -66,7 +66,7 @@ Levels oneByOne(const Real* rgba, int count, OutputFormat format)
 
 constexpr std::uint8_t untouched = 0xa5;
 
-// What convertPixels() makes of them at this place.
+// Converts with convertPixels() to memory at this offset.
 template <class Real>
 Levels together(const Real* rgba, int count, OutputFormat format, std::size_t offset = 0)
 {
@@ -81,7 +81,7 @@ Levels together(const Real* rgba, int count, OutputFormat format, std::size_t of
     return result;
 }
 
-// The same in plain C++, where the processor has more.
+// Converts in plain C++, where the processor has faster instructions.
 template <class Real>
 Levels plainly(const Real* rgba, int count, OutputFormat format)
 {
@@ -92,15 +92,15 @@ Levels plainly(const Real* rgba, int count, OutputFormat format)
     return result;
 }
 
-// A distance may be given as too large, but only for what is no tie; and never as too small.
+// The distance from a tie may be given as too large, but only for a value that is no tie, and never as too small.
 bool isRight(const Levels& result, const Levels& expected)
 {
     return result.bytes == expected.bytes && result.farthest >= expected.farthest
            && result.farthest <= std::max(expected.farthest, std::min(expected.farthest + 0x1p-15, 0.5 - 0x1p-16));
 }
 
-// Each value alone among others that are levels, so that nothing but itself decides how its block is converted; in each
-// place of a block in turn.
+// Tests each value among values that are exact levels, so that only this value decides how its block is converted. It
+// takes each place in a block in turn.
 template <class Real>
 class Alone {
 public:
@@ -121,7 +121,7 @@ public:
         }
     }
 
-    // This value and what is next to it: the floats, the doubles, and steps of a sixteenth of a float.
+    // Adds the value and its neighbours: floats, doubles, and steps of a sixteenth of a float.
     void addAround(double value)
     {
         auto low = static_cast<float>(value), high = low;
@@ -174,7 +174,7 @@ int wrongAtEnds()
         values.push_back(std::nextafter(value, Real(-1)));
         values.push_back(std::nextafter(value, Real(3)));
     }
-    for (int round = 0; round < 32; ++round) // in each place of a block
+    for (int round = 0; round < 32; ++round) // one round for each place in a block
         for (const Real value : values) {
             alone.add(static_cast<double>(value));
             alone.add(static_cast<double>(-value));
@@ -249,7 +249,7 @@ TEST_CASE("The cells of the sRGB curve say what a search says, at their edges an
         check(static_cast<double>(start));
         for (std::uint32_t i = 0; i < 0x10000; i += 97)
             check(static_cast<double>(dfb::detail::floatOf(((SrgbCells::first + cell) << 16) + i)));
-        // Around the cell's edge there is room for what is near to a threshold.
+        // There must be room around the edges of a cell for values that are near a threshold.
         const std::uint32_t place = cells.data()[cell] & 0x1ffff;
         thresholds += place != SrgbCells::none;
         wrong += place != SrgbCells::none && (place < 8 || place > 0xfff8);

@@ -1,4 +1,4 @@
-// TileLayout and owner maps: every pixel in one tile, every tile with one owner.
+// TileLayout and owner maps: every pixel is in one tile, and every tile has one owner.
 #include "catch.hpp"
 
 #include <dfb/tile_layout.hpp>
@@ -88,12 +88,12 @@ TEST_CASE("Owner maps give every tile to a rank, evenly", "[layout]")
             };
             const auto linear = spread(dfb::linearOwner);
             CHECK(linear.second - linear.first <= 1);
-            // A row of the lattice goes round the ranks, so within a row, and thus in all, a rank has at most one tile
-            // a row more than another.
+            // A row of the lattice goes round the ranks. So within a row one rank has at most one tile more than
+            // another, and in all at most one for each row.
             const auto lattice = spread(dfb::latticeOwner);
             CHECK(lattice.second - lattice.first <= layout.tilesY());
-            // A random scatter: counts are binomial, mean m and deviation below sqrt(m); 6 deviations, and 6 for small
-            // m.
+            // A random scatter: counts are binomial, with mean m and deviation below sqrt(m). Allows 6 deviations, and
+            // 6 more for small m.
             const auto hashed = spread(dfb::hashOwner);
             const double mean = static_cast<double>(layout.tileCount()) / ranks;
             CHECK(hashed.second <= mean + 6 * std::sqrt(mean) + 6);

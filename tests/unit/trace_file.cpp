@@ -1,4 +1,4 @@
-// TraceFile: what it keeps, what it counts when it is full, and that it begins anew after it has written.
+// TraceFile: which events it keeps, which it counts when it is full, and that it begins anew after writing.
 #include "catch.hpp"
 
 #include <dfb/trace_file.hpp>

@@ -1,4 +1,4 @@
-// The namespace of a version: what two versions of the library compile in one process has different names.
+// The namespace of a version: two versions of the library that are compiled into one process have different names.
 #include "catch.hpp"
 
 #include <dfb/image.hpp>

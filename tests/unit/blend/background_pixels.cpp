@@ -1,4 +1,4 @@
-// BackgroundPixels: what a tile has in the image is written again where it must be, and nowhere else.
+// BackgroundPixels: pixels of a tile that show the background already are written again only if they must be.
 #include "catch.hpp"
 
 #include <dfb/blend/background_pixels.hpp>
@@ -30,7 +30,7 @@ TEST_CASE("Of pixels that become background those are written that are not", "[b
                 std::fill(at + x, at + x + count, false);
                 continue;
             }
-            int last = x - 1; // the end of the last run: runs do not touch
+            int last = x - 1; // the end of the last run, as runs do not touch
             pixels.add(x, y, count, [&](int from, int some) {
                 ++writes;
                 REQUIRE((some > 0 && from > last && from + some <= x + count));
@@ -61,7 +61,7 @@ TEST_CASE("Nothing is known of another image, or of none", "[background_pixels]"
     pixels.newFrame(128, 2, 0); // a message
     CHECK(written(pixels) == 100);
     CHECK(written(pixels) == 100);
-    pixels.newFrame(128, 2, 2); // what the display rank has put there is not known
+    pixels.newFrame(128, 2, 2); // it is not known what the display rank has put there
     CHECK(written(pixels) == 100);
 }
 
@@ -88,7 +88,7 @@ TEST_CASE("A finished tile leaves alone what is the background already, and noth
     };
     CHECK(frame(all) == width * height);
     CHECK((color.back() == 1 && depth.back() == std::numeric_limits<float>::infinity()));
-    color.back() = 7; // which shows whether it is written
+    color.back() = 7; // shows whether it is written
     CHECK(frame(all) == 0);
     CHECK(color.back() == 7);
     const std::vector<double> rgba(4 * width, 0.25);

@@ -1,5 +1,5 @@
-// The kernels of blending and sorting: those by hand against those in plain C++, bit for bit, and what is made of them
-// against over(), layer by layer and pixel by pixel.
+// The kernels of blending and sorting. Vectorised ones equal those in plain C++, bit for bit, and what is built of them
+// equals over(), layer by layer and pixel by pixel.
 #include "catch.hpp"
 
 #include <dfb/ops/sort_last.hpp>
@@ -26,7 +26,7 @@ using dfb::testing::uniform;
 constexpr float infinity = std::numeric_limits<float>::infinity();
 constexpr float notANumber = std::numeric_limits<float>::quiet_NaN();
 
-// The same bits, but for NaNs, of which nobody promises which one comes out.
+// Whether all bits are the same. For NaNs any NaN will do, as which one results is not defined.
 bool isSame(const std::vector<double>& a, const std::vector<double>& b)
 {
     return std::equal(a.begin(), a.end(), b.begin(), b.end(), [](double x, double y) {
@@ -34,10 +34,10 @@ bool isSame(const std::vector<double>& a, const std::vector<double>& b)
     });
 }
 
-// What a set of layers is like, beside alpha and colour of any kind.
+// A special property of a set of layers. Alpha and colour are of any kind.
 enum class Kind { Any, Opaque, OddAlpha, NotFinite };
 
-// Layers of `width` pixels, each in memory of just that size, which begin `offset` floats into it.
+// Layers of `width` pixels. Each layer is in memory of exactly its size and begins `offset` floats into it.
 struct Stack {
     Stack(Random& random, Kind kind, int layerCount, int width)
     {
@@ -61,13 +61,13 @@ struct Stack {
                     c.push_back(value);
                 }
                 c.push_back(kind == Kind::NotFinite && below(random, 100) == 0 ? notANumber : alpha);
-                // Surfaces that cross here and there, or depths without order.
+                // Surfaces that cross here and there, or depths in no order.
                 z.push_back(depthKind == 7 ? base + tilt * static_cast<float>(i) / 16
                                            : dfb::testing::anyDepth(random, depthKind));
                 if (below(random, 50) == 0)
                     z.back() = below(random, 2) ? infinity : -infinity;
             }
-            c.shrink_to_fit(); // so that AddressSanitizer sees what is read beyond
+            c.shrink_to_fit(); // so that AddressSanitizer finds reads beyond the end
             z.shrink_to_fit();
         }
         for (std::size_t k = 0; k < colors.size(); ++k)
@@ -97,7 +97,7 @@ TEST_CASE("Blending a group of layers by hand gives the bits of plain C++", "[ke
         group.minTransmittance = anyLeast(random);
         for (const dfb::Layer& layer : stack.layers)
             group.colors[group.layers++] = layer.color;
-        // What is there already.
+        // What the pixels hold before.
         std::vector<double> rgba, transmittance;
         for (int i = 0; i < width; ++i) {
             transmittance.push_back(below(random, 2) ? 0.0 : static_cast<double>(uniform(random)));
@@ -144,7 +144,7 @@ TEST_CASE("A layer of levels under another is rounded to the nearest, by hand as
 {
     Random random(5);
     for (int alpha = 0; alpha < 256; ++alpha) {
-        constexpr int width = 261; // all levels behind, and a rest
+        constexpr int width = 261; // all levels behind, and a remainder
         std::vector<std::uint8_t> front(4 * width), behind(4 * width);
         for (int i = 0; i < 4 * width; ++i) {
             const auto at = static_cast<std::size_t>(i);
@@ -183,7 +183,7 @@ TEST_CASE("Layers in order are what over() makes of them one by one", "[kernels]
         }
         for (dfb::CompositeRow* r : {&row, &expected})
             for (double& t : r->transmittance)
-                t += 0.0; // behind an opaque pixel an alpha above 1 makes -0 of 0, if it is still looked at
+                t += 0.0; // an alpha above 1 behind an opaque pixel makes -0 of 0, if it is blended
         different += !isSame(row.rgba, expected.rgba) || !isSame(row.transmittance, expected.transmittance)
                      || row.depth != expected.depth;
     }
@@ -202,7 +202,7 @@ TEST_CASE("How far an order of depths holds: by hand as in plain C++", "[kernels
             order.losesTies[order.layers] = below(random, 4) > 0 ? 0 : -1;
             order.depths[order.layers++] = layer.depth;
         }
-        if (round % 2 == 0) // and where most of it is in order
+        if (round % 2 == 0) // rows that are mostly in order, too
             for (int i = 0; i < width; ++i)
                 for (int k = 0; k < order.layers; ++k)
                     const_cast<float*>(order.depths[k])[i] = below(random, 500) ? static_cast<float>(k) : 0.5f;
@@ -246,7 +246,7 @@ TEST_CASE("Four pixels are sorted by depth, then index, by hand as in plain C++"
             }
         }
     CHECK(different == 0);
-    // A NaN, which there ought not to be, is somewhere behind what is finite, and does no harm.
+    // A NaN among depths, which should not occur, does no harm: it is placed somewhere behind finite depths.
     const float depths[3][4] = {{notANumber, 1, notANumber, 1}, {2, notANumber, 2, 2}, {1, 3, -infinity, notANumber}};
     const float* const pointers[] = {depths[0], depths[1], depths[2]};
     d::FourOrders orders, plain;
@@ -298,7 +298,7 @@ TEST_CASE("Layers that are sorted are what over() makes of them one by one, pixe
         expected = row;
         expected.clear(0, x + width);
         if (round % 4 >= 2)
-            scratch.clear(); // else it is from other layers, mostly
+            scratch.clear(); // otherwise it mostly comes from other layers
         dfb::sortAndBlend(row, x, width, stack.layers, scratch);
         if (round % 4 == 0) {
             std::shuffle(scratch.begin(), scratch.end(), random);
@@ -329,8 +329,9 @@ TEST_CASE("Layers that are sorted are what over() makes of them one by one, pixe
 
 TEST_CASE("An infinity behind what is opaque shows nothing of the tile before", "[kernels]")
 {
-    // Whether such a pixel becomes a NaN depends on which pixels are blended with it, and that on the order that layers
-    // had before. All rows are alike but the last, which leaves the other order; each input is composited twice.
+    // Whether such a pixel becomes a NaN depends on which pixels are blended with it, and thus on the order in which
+    // layers were before. All rows are alike but the last, which leaves the other order. Each input is composited
+    // twice.
     dfb::testing::TileInputs<16> in;
     for (std::uint32_t source = 0; source < 2; ++source) {
         auto& tile = in.add(0, source);

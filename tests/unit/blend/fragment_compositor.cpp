@@ -1,4 +1,4 @@
-// FragmentCompositor: rows of fragments in order, beside a fold of each pixel by itself.
+// FragmentCompositor: rows of fragments in order equal a fold of each pixel by itself.
 #include "catch.hpp"
 
 #include <dfb/blend/fragment_compositor.hpp>
@@ -19,7 +19,7 @@ namespace {
 constexpr float infinity = std::numeric_limits<float>::infinity();
 constexpr int width = 290, height = 12;
 
-// The pixels of a fragment, in spans of about so many.
+// The pixels of a fragment, in spans of about `span` pixels.
 struct Pixels {
     std::vector<float> colors = std::vector<float>(4 * width * height), depths = std::vector<float>(width * height);
 
@@ -63,7 +63,7 @@ struct Folded {
     int layers = 0;
 };
 
-// Of inputs front to back.
+// Folds a pixel of inputs that are ordered front to back.
 Folded fold(const std::vector<const Pixels*>& inputs, std::size_t pixel, double minTransmittance)
 {
     Folded result;
@@ -91,7 +91,7 @@ std::vector<const Pixels*> inOrder(const std::vector<Pixels>& inputs)
     return all;
 }
 
-// By their depth at a pixel, in which NaN counts as farthest.
+// The inputs sorted by their depth at a pixel. NaN counts as farthest.
 std::vector<const Pixels*> sorted(const std::vector<Pixels>& inputs, std::size_t pixel)
 {
     const auto depthOf = [=](const Pixels* input) {
@@ -102,7 +102,7 @@ std::vector<const Pixels*> sorted(const std::vector<Pixels>& inputs, std::size_t
     return all;
 }
 
-// A compositor of inputs, all with the same bounds but the second, and a row for it.
+// A compositor of inputs that all have the same bounds, except the second one, and a row for it.
 struct Stack {
     dfb::detail::FaultCounts faults;
     std::vector<dfb::Fragment> fragments;
@@ -128,7 +128,7 @@ struct Stack {
         CHECK(static_cast<std::uint64_t>(faults.nonFinite) == nonFinite);
         CHECK(static_cast<std::uint64_t>(faults.alphaOutside) == alphaOutside);
     }
-    // Pixel x of the row.
+    // Checks pixel x of the row.
     void check(int x, const Folded& expected) const
     {
         const auto at = static_cast<std::size_t>(x);
@@ -185,7 +185,7 @@ TEST_CASE("Fragments in order are folded pixel by pixel, in long runs and in sho
                     REQUIRE(expected.layers == 1);
                     std::copy_n(runOf[x]->color + 4 * (static_cast<int>(x) - runOf[x]->x), 4, rgba);
                 }
-                CHECK(std::equal(rgba, rgba + 4, expected.rgba)); // all bits, or 0 and -0
+                CHECK(std::equal(rgba, rgba + 4, expected.rgba)); // all bits, except that 0 equals -0
                 if (hasDepth)
                     CHECK(row.depth[x] == expected.depth);
             }
@@ -193,7 +193,7 @@ TEST_CASE("Fragments in order are folded pixel by pixel, in long runs and in sho
     }
 }
 
-// What may be wrong with a row of inputs that have no gaps.
+// Flaws of a row of inputs that have no gaps.
 enum class Flaw { None, Hole, HoleInOne, NotFinite, AlphaOutside, Crossing, NanDepth };
 
 TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and sorted", "[compositing]")
@@ -221,7 +221,7 @@ TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and so
                     continue;
                 for (std::size_t c = 0; c < 4; ++c)
                     inputs[k].colors[4 * i + c] = static_cast<float>(1 + random() % 900) / 1000.0f;
-                // The row's order changes with y; equal depths, and 0 beside -0, are there, too.
+                // The order changes from row to row. Some depths are equal, and some are 0 beside -0.
                 inputs[k].depths[i] = y % 4 == 3 ? (k % 2 ? 0.0f : -0.0f) : static_cast<float>((3 * k + y) % 11 / 2);
                 if (isFlawed && (flaw == Flaw::Hole || (flaw == Flaw::HoleInOne && k == 1)) && x >= 40 && x < 120)
                     std::fill_n(&inputs[k].colors[4 * i], 4, x % 2 ? 0.0f : -0.0f);
@@ -237,7 +237,7 @@ TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and so
             }
         std::vector<Pixels> given = inputs;
         for (int i = 0; i < width * height; ++i)
-            if (!validOfSecond.contains(i % width, i / width)) // not to be read
+            if (!validOfSecond.contains(i % width, i / width)) // must not be read
                 std::fill_n(&given[1].colors[4 * static_cast<std::size_t>(i)], 4, 0.5f);
         Stack stack(given, isSorted, isSorted, valid, validOfSecond, least);
         for (int y = 0; y < height; ++y) {
@@ -272,7 +272,8 @@ TEST_CASE("Rows in place with many gaps are folded pixel by pixel, in order and 
         std::vector<Pixels> inputs;
         for (std::size_t k = 0; k < layers; ++k)
             inputs.emplace_back(random, round % 3 == 0 ? 4 : round % 3 == 1 ? 20 : 60, false);
-        // Now and then something that a row must not have, be it beside a gap: it is composited otherwise, and counted.
+        // A few pixels have values that a row must not have, some of them beside a gap. They are composited in another
+        // way, and counted.
         std::uint64_t nonFinite = 0, alphaOutside = 0;
         for (Pixels& input : inputs)
             for (std::size_t i = 0; i < input.depths.size(); ++i) {
@@ -295,7 +296,7 @@ TEST_CASE("Rows in place with many gaps are folded pixel by pixel, in order and 
             std::vector<bool> isInRun(width);
             int end = -1000;
             for (const auto& run : stack.compositor.runs()) {
-                CHECK(run.x > end); // a run ends where there is nothing
+                CHECK(run.x > end); // a run ends at a gap
                 end = run.x + run.count;
                 std::fill_n(isInRun.begin() + run.x, run.count, true);
             }

@@ -1,4 +1,4 @@
-// CompressionGains: who does not gain is left alone, and asked again more and more seldom.
+// CompressionGains: a rank for which compression gains nothing is skipped, and tried again more and more rarely.
 #include "catch.hpp"
 
 #include <dfb/comm/compression.hpp>
@@ -11,14 +11,14 @@ namespace compression_gains_cases {
 
 namespace {
 
-// In which of so many frames rank 1 of 2 is worthwhile, if messages of 1000 bytes to it become `sent(frame)`.
+// The frames, of `frames`, in which compression for rank 1 of 2 is tried, if 1000 bytes to it become `sent(frame)`.
 template <class Sent>
 std::vector<int> triedIn(int frames, const Sent& sent)
 {
     dfb::detail::CompressionGains gains(2);
     std::vector<int> tried;
     for (int frame = 0; frame < frames; ++frame) {
-        CHECK(gains.isWorthwhile(0)); // who is not sent anything
+        CHECK(gains.isWorthwhile(0)); // nothing is sent to it
         if (gains.isWorthwhile(1)) {
             tried.push_back(frame);
             gains.add(1, 600, static_cast<std::size_t>(sent(frame)) - 400);
@@ -50,20 +50,21 @@ TEST_CASE("Compression for a rank that gains nothing is tried more and more seld
 TEST_CASE("A rank that begins to gain is compressed for again, if it is worth it", "[compression]")
 {
     CHECK(triedIn(1000, [](int frame) { return frame < 10 ? 1000 : 500; }).size() == 1000 - 16);
-    // Between giving up and coming back there is some room.
+    // There is a margin between giving up and coming back.
     CHECK(triedIn(1000, [](int frame) { return frame < 10 ? 1000 : 930; }).size() < 12);
 }
 
 } // namespace compression_gains_cases
 
-// CompressionTrial: the better of two ways is found and kept, whatever the noise, and again when things change.
+// CompressionTrial: finds the better of two ways and keeps it, whatever the noise, and finds it anew when things
+// change.
 namespace compression_trial_cases {
 
 using dfb::detail::CompressionTrial;
 
 namespace {
 
-// How many of `frames` frames were compressed, and the time of them all. `time(compressed, frame)`: of one.
+// The number of compressed frames, and the time of all frames. `time(compressed, frame)` is the time of one frame.
 struct Run {
     int compressed = 0;
     double total = 0;
@@ -137,7 +138,7 @@ TEST_CASE("When the network becomes slow, or fast again, it is noticed soon", "[
     run(trial, 3000, slow);
     CHECK(run(trial, 50, fast).compressed < 20);
     CHECK_FALSE(trial.compresses());
-    // If nothing else changes than which is better, at the next trial.
+    // If only the better way changes, this is noticed at the next trial.
     CHECK(run(trial, 2000, [](bool compressed, int) { return compressed ? 0.7 : 1.0; }).compressed > 1000);
 }
 

@@ -1,4 +1,4 @@
-// SequenceWindow and Connection over a transport that the test plays: numbers, checksums, addresses, failure.
+// SequenceWindow and Connection, over a transport that the test simulates: numbers, checksums, addresses, failures.
 #include "catch.hpp"
 
 #include <dfb/comm/connection.hpp>
@@ -25,7 +25,7 @@ using dfb::detail::MessageHeader;
 using dfb::detail::MessageKind;
 using dfb::detail::SequenceWindow;
 
-// What a rank's transport has sent, and a way to hand it messages.
+// The messages that a rank's transport has sent, and its handler, to hand it messages.
 struct Wire {
     int rank = 0, size = 1;
     dfb::TransportHandler* handler = nullptr;
@@ -110,7 +110,7 @@ Buffer copyOf(dfb::MemoryPool& pool, const Buffer& message)
 
 MessageHeader headerOf(const Buffer& message) { return dfb::detail::loadAs<MessageHeader>(message.data()); }
 
-// Moves what `from` has sent to `to` there.
+// Delivers the messages of `from` that are for `to`.
 void carry(Wire& from, Wire& to)
 {
     for (auto& [destination, message] : std::exchange(from.sent, {}))
@@ -174,7 +174,7 @@ TEST_CASE("A number far from the others is refused and changes nothing", "[conne
     CHECK_THROWS_AS(window.arrive((1u << 20) + 2), dfb::Error); // one more than may be missing
     CHECK_THROWS_AS(window.arrive(0x7fffffffu), dfb::Error);
     CHECK(window.missing() == 0);
-    CHECK_FALSE(window.arrive(0x80000000u + 1)); // behind: never missing, so not new
+    CHECK_FALSE(window.arrive(0x80000000u + 1)); // behind the window: never missing, so not new
     CHECK_FALSE(window.arrive(0xffffffffu));
     CHECK(window.arrive(1));
     CHECK(window.missing() == 0);
@@ -183,7 +183,7 @@ TEST_CASE("A number far from the others is refused and changes nothing", "[conne
     CHECK(window.arrive(2));
     CHECK_FALSE(window.arrive(2));
     CHECK(window.missing() == (1u << 20) - 1);
-    CHECK_THROWS_AS(window.arrive((1u << 20) + 5), dfb::Error); // so many are missing in all
+    CHECK_THROWS_AS(window.arrive((1u << 20) + 5), dfb::Error); // too many would be missing in all
     CHECK(window.arrive((1u << 20) + 4));
     CHECK(window.missing() == 1u << 20);
 }
@@ -235,7 +235,7 @@ TEST_CASE("Messages that come twice are dropped and counted, whatever they are f
         b->handler->receive(0, copyOf(*sender->pool(), message));
     CHECK(receiver.got.size() == 10);
     CHECK(connection->duplicates() == 10);
-    // The same numbers of another rank are no duplicates.
+    // The same numbers from another rank are not duplicates.
     b->handler->receive(3, copyOf(*sender->pool(), a->sent[0].second));
     CHECK(receiver.got.size() == 11);
     CHECK(connection->duplicates() == 10);
@@ -300,11 +300,11 @@ TEST_CASE("With checksums, no single bit, no byte and no length can be changed u
     }
     CHECK(first.got.empty());
     CHECK(second.got.empty());
-    // It may have been for either.
+    // The damaged message may have been for either receiver.
     CHECK(first.malformedFrom.size() == tries);
     CHECK(second.malformedFrom == std::vector<int>(tries, 0));
     CHECK(connection->duplicates() == 0);
-    // And what was refused does not count as having come.
+    // Messages that were refused do not count as received.
     deliver(copyOf(*sender->pool(), good));
     CHECK(second.got.size() == 1);
     CHECK(connection->lost().empty());
@@ -405,7 +405,7 @@ TEST_CASE("Who gives up says so to all others, once, and they cannot go on eithe
         INFO(text);
         CHECK(text.find("rank 0") != std::string::npos);
         CHECK(text.find("the moon is full") != std::string::npos);
-        CHECK(b->sent.empty()); // who is told does not tell
+        CHECK(b->sent.empty()); // a rank that is told does not tell others
         quitter->detach(address);
         other->detach(address);
     }

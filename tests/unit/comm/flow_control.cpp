@@ -1,5 +1,5 @@
-// FlowControl over a simulated network, without threads: any number of ranks, messages that are delivered and taken out
-// of the inbox in whatever order a seed says.
+// FlowControl over a simulated network, without threads: any number of ranks, and messages that are delivered and
+// consumed in an order that a seed determines.
 #include "catch.hpp"
 
 #include <dfb/comm/flow_control.hpp>
@@ -27,15 +27,15 @@ std::size_t allowanceOf(int ranks, std::size_t pool)
     return ranks > 1 ? pool / 2 / (static_cast<std::size_t>(ranks) - 1) : 0;
 }
 
-// The most that a rank may still take for under way when all it sent has been consumed: what each receiver need not
-// say yet.
+// The most bytes that a rank may still count as under way when everything it sent was consumed: what each receiver may
+// keep to itself for the time being.
 std::size_t idleBound(int ranks, std::size_t pool)
 {
     const std::size_t half = allowanceOf(ranks, pool) / 2;
     return (static_cast<std::size_t>(ranks) - 1) * (half > 0 ? half - 1 : 0);
 }
 
-// What happens next is drawn by weight; a weight of 0 is only used when nothing else can happen.
+// The next event is drawn by these weights. An event of weight 0 only happens if no other can.
 struct Habits {
     unsigned send = 10, deliverData = 10, deliverControl = 10, consume = 10;
     enum class Order { Any, OldestFirst, NewestFirst } consumeOrder = Order::Any, deliverOrder = Order::Any;
@@ -80,10 +80,10 @@ public:
     FlowControl& flow(int rank) { return *node(rank).flow; }
     std::size_t mostOutstanding() const { return mostOutstanding_; }
 
-    // To be sent when its turn comes.
+    // Adds a message that is sent when its turn comes.
     void plan(int from, int to, std::size_t bytes) { node(from).plan.push_back({to, bytes}); }
 
-    // Until nothing can happen any more, or `steps` are done.
+    // Runs until no event is possible, or for `steps` events.
     void run(std::size_t steps = static_cast<std::size_t>(-1))
     {
         while (steps-- > 0 && step()) {
@@ -99,7 +99,8 @@ public:
 
     // ---- epochs
 
-    // One rank begins the next; what came early for it is seen to now. The rest of its plan is forgotten.
+    // Begins the next epoch on one rank. Handles messages that came early for it, and drops the rest of the rank's
+    // plan.
     void nextEpoch(int rank)
     {
         Node& n = node(rank);
@@ -117,7 +118,7 @@ public:
             handleControl(p);
     }
 
-    // Everything that is on its way is lost.
+    // Loses all messages under way.
     void loseAll()
     {
         for (const Packet& p : data_)
@@ -126,7 +127,7 @@ public:
         control_.clear();
     }
 
-    // One message that is on its way, if there is any.
+    // Loses one message under way, if there is any.
     void loseOne()
     {
         auto& list = random_() % 2 || control_.empty() ? data_ : control_;
@@ -157,12 +158,12 @@ private:
         std::unique_ptr<FlowControl> flow;
         int epoch = 1;
         std::deque<Planned> plan;
-        std::vector<Packet> inbox; // data, also of epochs to come
-        std::vector<Packet> early; // the other messages of epochs to come
+        std::vector<Packet> inbox; // data, also of later epochs
+        std::vector<Packet> early; // other messages of later epochs
     };
 
     Node& node(int rank) { return *nodes_[static_cast<std::size_t>(rank)]; }
-    // Bytes transmitted to this rank and not yet out of its inbox, of whichever epoch.
+    // Bytes that were transmitted to this rank and are not yet out of its inbox, of all epochs.
     std::size_t& outstanding(int rank)
     {
         outstanding_.resize(nodes_.size());
@@ -283,19 +284,19 @@ private:
     std::mt19937_64 random_;
     std::shared_ptr<dfb::MemoryPool> memory_ = dfb::MemoryPool::create();
     std::vector<std::unique_ptr<Node>> nodes_;
-    std::vector<Packet> data_, control_; // on their way
+    std::vector<Packet> data_, control_; // under way
     std::vector<std::size_t> outstanding_;
     std::size_t mostOutstanding_ = 0;
     std::uint64_t numbers_ = 0;
 };
 
-// What a seed stands for.
+// A configuration that follows from a seed.
 struct Case {
     int ranks;
     std::size_t largest, pool;
     Habits habits;
     int messages; // of each rank
-    bool toOne;   // all to rank 0, else to any
+    bool toOne;   // all to rank 0, otherwise to any rank
     enum class Sizes { Any, Largest, MostlySmall } sizes;
 };
 
@@ -313,7 +314,7 @@ Case caseOf(std::uint64_t seed)
     c.habits.send = pick(2) ? 1 : 100;
     c.habits.deliverData = pick(4) ? 10 : 0;
     c.habits.deliverControl = pick(4) ? 10 : 0;
-    c.habits.consume = pick(3) ? 10 : pick(2); // in the extreme, only when nothing else is left to do
+    c.habits.consume = pick(3) ? 10 : pick(2); // at the extreme, only when nothing else is possible
     c.habits.consumeOrder = static_cast<Habits::Order>(pick(3));
     c.habits.deliverOrder = static_cast<Habits::Order>(pick(3));
     c.messages = c.ranks > 13 ? 4 : 3 + static_cast<int>(pick(60));
@@ -322,7 +323,7 @@ Case caseOf(std::uint64_t seed)
     return c;
 }
 
-// The number of messages that the plan has.
+// Plans the messages of a case and returns their number.
 std::int64_t planFor(Network& network, const Case& c, std::uint64_t seed)
 {
     std::mt19937_64 random(seed * 977 + 1);
@@ -348,7 +349,7 @@ std::string describe(const Case& c, std::uint64_t seed)
            + std::to_string(c.largest) + ", pool " + std::to_string(c.pool) + (c.toOne ? ", all to one" : "");
 }
 
-// A rank's figures when all is over; empty if they are in order.
+// Checks the figures of all ranks when everything is over. Returns "" if they are right.
 std::string wrongAtRest(Network& network, std::size_t pool)
 {
     for (int rank = 0; rank < network.size(); ++rank) {
@@ -403,7 +404,7 @@ TEST_CASE("Whatever the order of delivery and consumption, all arrives and no po
     CHECK(wrong.empty());
     if (!wrong.empty())
         UNSCOPED_INFO(wrong);
-    CHECK(asked > 10000); // the cases are tight ones
+    CHECK(asked > 10000); // the cases are tight
 }
 
 TEST_CASE("One message after the other from each of many senders, with no part of the pool of their own", "[flow]")
@@ -421,13 +422,13 @@ TEST_CASE("One message after the other from each of many senders, with no part o
             CHECK(network.consumed == 20 * (ranks - 1));
             CHECK(network.mostOutstanding() <= 4);
             for (int rank = 0; rank < ranks && ranks > 3; ++rank)
-                CHECK(network.flow(rank).underWay() == 0); // every consumption is told
+                CHECK(network.flow(rank).underWay() == 0); // every consumption is reported
         }
 }
 
 TEST_CASE("Epochs that end well follow each other, begun by each rank at its own time", "[flow]")
 {
-    // The next may begin on one rank while others have not begun it: both together stay below the pool.
+    // One rank may begin the next epoch before others do. Both epochs together stay below the pool.
     std::string wrong;
     for (std::uint64_t seed = 1; seed <= 400 && wrong.empty(); ++seed) {
         const Case c = caseOf(seed);
@@ -480,7 +481,7 @@ TEST_CASE("After an epoch that lost messages or was dropped the next one works l
                 network.run(random() % 20);
                 network.loseOne();
             }
-            const bool lose = random() % 2; // else what is on its way comes when its epoch is over
+            const bool lose = random() % 2; // otherwise messages under way come after their epoch
             for (int rank = 0; rank < c.ranks; ++rank)
                 if (random() % 2)
                     network.flow(rank).drop([](const dfb::Buffer&) { return false; }, random() % 2 == 0);
@@ -524,7 +525,7 @@ TEST_CASE("With a large window there is little else than data", "[flow]")
             for (int i = 0; i < messages; ++i)
                 network.plan(rank, 0, bytes);
         network.run();
-        // A Credit is for at least half a sender's part.
+        // Each Credit is for at least half of a sender's part.
         const std::size_t perSender = bytes * static_cast<std::size_t>(messages) / (allowanceOf(ranks, pool) / 2);
         INFO(ranks << " ranks: " << network.dataSent << " messages, " << network.requestsSent << " requests, "
                    << network.creditsSent << " credits");
@@ -618,7 +619,7 @@ TEST_CASE("A request that is not met yet is not repeated", "[flow]")
 TEST_CASE("A request that a later one has overtaken changes nothing", "[flow]")
 {
     std::vector<std::uint64_t> granted;
-    // 50 each, 200 on request.
+    // A part of 50 each, and 200 on request.
     FlowControl flow(5, 400,
                      {[](int, Buffer&&) {}, [](int, const FlowControl::Request&) {},
                       [&](int, const FlowControl::Credit& credit) { granted.push_back(credit.granted); }});
@@ -667,7 +668,7 @@ TEST_CASE("More than a pool is neither granted nor asked for", "[flow]")
     const std::uint64_t most = ~std::uint64_t{0};
     CHECK_THROWS_AS(link.flow->requested(1, {most, most}), dfb::Error);
     CHECK_THROWS_AS(link.flow->requested(1, {300, 299}), dfb::Error);
-    // For a message that cannot be:
+    // A request for a message that cannot exist.
     CHECK_THROWS_AS(link.flow->requested(1, {301, 301}), dfb::Error);
     link.flow->requested(1, {300, 350}); // and nobody waits behind them
     REQUIRE(link.credits.size() == 1);
@@ -683,12 +684,12 @@ TEST_CASE("drop() forgets what waits, or what nobody has asked for, and keeps no
     }
     CHECK(link.flow->underWay() == 500);
     all.flow->drop([](const dfb::Buffer&) { return false; }, false);
-    CHECK(all.flow->underWay() == 200); // what is on its way
+    CHECK(all.flow->underWay() == 200); // what is under way
     CHECK(all.flow->allSent());
     link.flow->drop([](const dfb::Buffer&) { return false; }, true);
     CHECK_FALSE(link.flow->allSent());
-    // What is on its way, and the message whose credit the receiver will set aside: if it stayed unused, others would
-    // get none.
+    // The messages under way, and the one whose credit the receiver will reserve. If that credit stayed unused, others
+    // would get none.
     CHECK(link.flow->underWay() == 250);
     link.send(50);
     CHECK(link.transmitted.size() == 4);
@@ -700,7 +701,7 @@ TEST_CASE("drop() forgets what waits, or what nobody has asked for, and keeps no
     CHECK(link.flow->underWay() == 0);
     for (int i = 0; i < 5; ++i)
         link.send(50);
-    CHECK(link.transmitted.size() == 9); // the first part again, not the 600 of the last epoch
+    CHECK(link.transmitted.size() == 9); // the own part again, not the 600 bytes of the last epoch
     CHECK(link.flow->underWay() == 250);
 }
 
@@ -711,7 +712,7 @@ TEST_CASE("A receiver answers in the order of asking, the whole or the first mes
         std::uint64_t granted;
     };
     std::vector<Told> told;
-    // 4 senders with 50 each, 200 on request.
+    // 4 senders with a part of 50 each, and 200 on request.
     FlowControl flow(5, 400,
                      {[](int, Buffer&&) {}, [](int, const FlowControl::Request&) {},
                       [&](int source, const FlowControl::Credit& credit) {
@@ -727,7 +728,7 @@ TEST_CASE("A receiver answers in the order of asking, the whole or the first mes
     flow.requested(4, {51, 51}); // none is left
     flow.requested(1, {101, 101});
     CHECK(told.size() == 3);
-    // The first in the queue gets what comes back, though the other would fit as well.
+    // What comes back goes to the first in the queue, though the other request would fit as well.
     flow.arrived(30);
     flow.consumed(3, 30);
     REQUIRE(told.size() >= 4);

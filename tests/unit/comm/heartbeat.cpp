@@ -1,4 +1,5 @@
-// Heartbeat: who listens for whom, who is asked when, who is lost when, and when time does not count.
+// Heartbeat: which ranks listen for each other, when a rank is asked, when it counts as lost, and which time is left
+// out.
 #include "catch.hpp"
 
 #include <dfb/comm/heartbeat.hpp>
@@ -22,7 +23,7 @@ using std::chrono::milliseconds;
 constexpr int timeoutMs = 3200;
 constexpr int stepMs = 100; // interval()
 
-// A heartbeat whose clock the test moves on.
+// A Heartbeat whose clock the test advances.
 struct Rank {
     Heartbeat beat;
     Heartbeat::Time now = Heartbeat::Time{} + std::chrono::hours(1);
@@ -67,7 +68,7 @@ TEST_CASE("A rank listens for its neighbours in the tree of reductions, and they
             CHECK(beat.isOn() == (size > 1));
             CHECK(listens[static_cast<std::size_t>(rank)].size() == neighbours.size());
             CHECK(neighbours.size() <= 6);
-            // Those of the reduction: its children, which it waits for, and its parent.
+            // The neighbours are those of the reduction: the children, for which it waits, and the parent.
             dfb::ReductionTable table(rank, size, [](int, const dfb::ReductionKey&, bool, const auto&) {});
             const auto combine = [](const auto& a, const auto&) { return a; };
             const dfb::ReductionKey key{1, 1};
@@ -82,7 +83,7 @@ TEST_CASE("A rank listens for its neighbours in the tree of reductions, and they
         for (int a = 0; a < size; ++a)
             for (const int b : listens[static_cast<std::size_t>(a)])
                 CHECK(listens[static_cast<std::size_t>(b)].count(a) == 1);
-        // Whichever ranks are lost, one of them has a neighbour that is not: the tree holds together.
+        // The tree is connected: whichever ranks are lost, one of them has a neighbour that is not lost.
         std::set<int> reached{0};
         for (std::vector<int> open{0}; !open.empty();) {
             const int a = open.back();
@@ -129,7 +130,7 @@ TEST_CASE("Any message is a sign of life of its sender, and of nobody else", "[h
     CHECK(rank.lost == 2);
     CHECK(rank.lostAt == timeoutMs);
     CHECK(std::count(rank.asked.begin(), rank.asked.end(), 1) == 0);
-    // A single message, at any time, puts it off by the whole time-out.
+    // A single message, at any time, postpones the loss by the whole time-out.
     Rank later(1, 2);
     later.steps(timeoutMs / stepMs - 1);
     later.beat.heard(0, false);
@@ -144,7 +145,7 @@ TEST_CASE("Who has never said that it answers is neither asked nor lost", "[hear
 {
     Heartbeat beat({0}, milliseconds(timeoutMs));
     auto now = Heartbeat::Time{} + std::chrono::hours(1);
-    beat.heard(0, false); // a message, but no promise
+    beat.heard(0, false); // a message, but no promise to answer
     for (int i = 0; i < 3 * timeoutMs / stepMs; ++i, now += milliseconds(stepMs)) {
         const auto due = beat.due(now, true);
         CHECK((due.ask.empty() && due.lost < 0));
@@ -181,7 +182,7 @@ TEST_CASE("A rank that was held itself counts from then on", "[heartbeat]")
         rank.step();
         CHECK(rank.lostAt == start + timeoutMs);
     }
-    // A gap that is no longer than a rank may take to answer is none.
+    // A gap no longer than the time that a rank may take to answer does not count as one.
     Rank rank(1, 2);
     while (rank.lost < 0 && rank.ms < 10 * timeoutMs)
         rank.step(timeoutMs / 4);

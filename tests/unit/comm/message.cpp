@@ -1,4 +1,4 @@
-// CRC-32C: the vectors of RFC 3720, both ways of computing it, pieces, and what it must find.
+// CRC-32C: the vectors of RFC 3720, both implementations, sums of pieces, and errors that it must find.
 #include "catch.hpp"
 
 #include <dfb/comm/message.hpp>
@@ -18,7 +18,7 @@ namespace {
 using Bytes = std::vector<std::byte>;
 using dfb::detail::crc32cByTable;
 
-// Does nothing else on a processor without the instruction.
+// On a processor without the instruction this is crc32cByTable().
 const dfb::detail::Crc32cFunction fastest = dfb::detail::fastestCrc32c();
 
 Bytes randomBytes(std::size_t count)
@@ -29,7 +29,7 @@ Bytes randomBytes(std::size_t count)
     return bytes;
 }
 
-// The definition, bit by bit.
+// The definition of CRC-32C, bit by bit.
 std::uint32_t reference(const std::byte* data, std::size_t byteCount)
 {
     std::uint32_t sum = 0xffffffff;

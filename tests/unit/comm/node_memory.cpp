@@ -1,5 +1,5 @@
-// NodeMemory: blocks are seen by other processes, come back when those let go of them, and no more is believed of an
-// address or a place than is true.
+// NodeMemory: other processes see blocks, blocks come back when those processes release them, and invalid addresses and
+// places are refused.
 #include "catch.hpp"
 
 #include <dfb/comm/node_memory.hpp>
@@ -56,7 +56,7 @@ TEST_CASE("The memory has large pages, if the system makes them", "[memory]")
                 map >> count;
         return count;
     };
-    // Only Linux 6.1 and later make them when they are asked to, and only where a free one is found.
+    // Only Linux 6.1 and later make large pages on request, and only if a free one is found.
     if (madvise(blocks[1], page, 25) != 0)
         return;
     CHECK(largePages() >= 4 * 2048);
@@ -67,9 +67,9 @@ TEST_CASE("A doorbell ends a nap, or the next one, and wakes only who wants to b
     using namespace std::chrono;
     SharedPool s;
     dfb::detail::Doorbell &mine = s.memory->doorbell(),
-                          &others = s.seen->doorbell(); // the same, as another process has it
+                          &others = s.seen->doorbell(); // the same one, mapped as by another process
     dfb::detail::Doorbell::Listener listener(mine);
-    // The time is the assertion: a nap that nobody ends takes a minute.
+    // The time is the assertion: a nap that is not ended takes a minute.
     const auto isShort = [&](bool isAwaiting, const auto& before, const auto& meanwhile) {
         before();
         const auto start = steady_clock::now();
@@ -81,7 +81,7 @@ TEST_CASE("A doorbell ends a nap, or the next one, and wakes only who wants to b
     const auto nothing = [] {};
     const auto ring = [&] { others.ring(); };
     const auto interrupt = [&] { mine.interrupt(); };
-    // Whether the nap has begun by then decides only which of two ways is tested.
+    // Whether the nap has begun by then only decides which of two ways is tested.
     const auto later = [](const auto& f) {
         return [&f] {
             std::this_thread::sleep_for(milliseconds(20));
@@ -96,7 +96,7 @@ TEST_CASE("A doorbell ends a nap, or the next one, and wakes only who wants to b
     }
     CHECK(isShort(true, nothing, ring));
     CHECK(isShort(true, nothing, later(ring)));
-    // An interrupt ends one nap, also if it has looked since; a ring that it has looked after ends none.
+    // An interrupt ends one nap, even if the listener has looked since. A ring before a look ends none.
     mine.interrupt();
     others.ring();
     listener.look();
@@ -116,7 +116,7 @@ TEST_CASE("Where files may not be that long there is no memory, and the process 
     rlimit low = before;
     low.rlim_cur = 1 << 20;
     REQUIRE(setrlimit(RLIMIT_FSIZE, &low) == 0);
-    const auto memory = NodeMemory::create(); // no assertion yet: it may write to a file
+    const auto memory = NodeMemory::create(); // no assertion here, as it might write to a file
     REQUIRE(setrlimit(RLIMIT_FSIZE, &before) == 0);
     CHECK_FALSE(memory);
 }
@@ -132,7 +132,7 @@ TEST_CASE("What one process writes another reads in the same place, and gives ba
     const std::int32_t place = s.memory->placeOf(block);
     CHECK(s.memory->isLent(block));
     const pid_t child = fork();
-    if (child == 0) { // no assertions here: they would be the parent's
+    if (child == 0) { // no assertions here, as they would be the parent's
         const auto memory = NodeMemory::open(s.memory->address());
         int code = 1;
         if (memory) {
@@ -166,7 +166,7 @@ TEST_CASE("A block is not used again before it is back, whoever lets go of it", 
         CHECK(lent.insert(block).second);
         borrowed.push_back(s.seen->borrow(s.memory->placeOf(block), 5000));
         REQUIRE(borrowed.back().size() == 5000);
-        CHECK(borrowed.back().data() != block); // mapped once more
+        CHECK(borrowed.back().data() != block); // mapped a second time
     }
     for (int i = 0; i < 20; ++i)
         CHECK(borrowed[static_cast<std::size_t>(i)].data()[4999] == static_cast<std::byte>(i));
@@ -182,7 +182,7 @@ TEST_CASE("A block is not used again before it is back, whoever lets go of it", 
     for (const Buffer& b : borrowed)
         CHECK(b.data()[0] >= std::byte{10});
 
-    // What is borrowed outlives the lender's pool and mapping.
+    // A borrowed block outlives the lender's pool and mapping.
     s.pool.reset();
     s.memory.reset();
     again.clear();
@@ -201,7 +201,7 @@ TEST_CASE("Blocks that nobody else sees are not lent", "[memory]")
     Buffer small = s.pool->acquire(100);
     CHECK(s.pool->lend(small) == nullptr);
     CHECK(small.size() == 100);
-    Buffer huge = s.pool->acquire(NodeMemory::capacity); // there is not so much of it, so the pool takes other memory
+    Buffer huge = s.pool->acquire(NodeMemory::capacity); // more than there is, so the pool takes other memory
     CHECK(s.pool->lend(huge) == nullptr);
     CHECK(s.memory->take(NodeMemory::capacity) == nullptr);
     CHECK(s.memory->take(~std::size_t{0}) == nullptr);
@@ -235,7 +235,7 @@ TEST_CASE("A block is lent once, as a whole", "[memory]")
 {
     SharedPool s;
     Buffer buffer = s.pool->acquire(4096);
-    std::memset(buffer.data(), 1, buffer.size()); // as if each place in it were one of a block that is lent
+    std::memset(buffer.data(), 1, buffer.size()); // as if each place in it were that of a lent block
     const std::int32_t place = s.memory->placeOf(buffer.data());
     const std::byte* block = s.pool->lend(buffer);
     REQUIRE(block);

@@ -1,4 +1,4 @@
-// Packets: what goes in comes out, and bytes that are no packet are refused without a look beyond them.
+// Packets: records come out as they went in, and bytes that are not a packet are refused without reading beyond them.
 #include "catch.hpp"
 
 #include <dfb/comm/packet.hpp>
@@ -36,7 +36,8 @@ Bytes randomBytes(std::mt19937_64& random, std::size_t count)
 
 Bytes bytesOf(const dfb::Buffer& packet) { return {packet.data(), packet.data() + packet.size()}; }
 
-// The records of a packet, or none if it is refused. The copy has the exact size, for the address sanitizer.
+// Reads the records of a packet into `items`; false if it is refused. Copies it to its exact size, for
+// AddressSanitizer.
 bool read(const Bytes& packet, std::vector<Item>& items)
 {
     const auto exact = std::make_unique<std::byte[]>(packet.size());
@@ -83,7 +84,7 @@ TEST_CASE("What goes into packets comes out of them, in order", "[packet]")
         wrong +=
             std::memcmp(&put[i].record, &got[i].record, sizeof put[i].record) != 0 || put[i].payload != got[i].payload;
     CHECK(wrong == 0);
-    CHECK(packets < 1000); // that is, they are filled
+    CHECK(packets < 1000); // the packets are filled
     CHECK(PacketWriter::canHold(packetBytes - 16));
     CHECK_FALSE(PacketWriter::canHold(packetBytes - 15));
 }

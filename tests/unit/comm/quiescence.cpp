@@ -1,5 +1,5 @@
-// Quiescence: against a model of ranks that send each other work, in random order. What is said of a world in which
-// something is under way is wrong, however unlikely; and of one in which nothing is, it is said at some time.
+// Quiescence, checked with a model of ranks that send each other work in random order. It must never claim that nothing
+// is under way while something is, however unlikely that is, and must claim it at some time when nothing is.
 #include "catch.hpp"
 
 #include <dfb/comm/quiescence.hpp>
@@ -19,14 +19,14 @@ using dfb::detail::Quiescence;
 
 struct Outcome {
     int claims = 0, wrongClaims = 0;  // that nothing is under way
-    int wrongRounds = 0;              // in which the sums were equal while something was: no proof without the next one
+    int wrongRounds = 0;              // sums were equal while work was under way: needs a second round
     bool isQuiet = false;             // the world, at the end
     std::vector<std::int64_t> rounds; // that each rank has ended by then
 };
 
 class World {
 public:
-    // `loses`: one of so many messages never arrives; 0: none.
+    // `loses`: one of so many messages never arrives; 0: none is lost.
     World(std::uint64_t seed, int ranks, int work, int loses = 0)
         : random_(seed), loses_(loses), work_(work), ranks_(static_cast<std::size_t>(ranks))
     {
@@ -38,7 +38,7 @@ public:
 
     Outcome run(int steps)
     {
-        // How often each thing happens: in some worlds messages are slow, in others rounds are.
+        // The frequency of each kind of event: in some worlds messages are slow, in others rounds are.
         int weights[4];
         for (int& w : weights)
             w = 1 + pick(pick(2) == 0 ? 3 : 40);
@@ -59,10 +59,10 @@ public:
 private:
     struct Rank {
         Quiescence quiescence;
-        int tasks = 0;   // messages that have come and what it has to do by itself
-        int untaken = 0; // so many of them are messages
+        int tasks = 0;   // arrived messages, and own work
+        int untaken = 0; // how many of them are messages
         std::uint64_t sent = 0, taken = 0;
-        std::deque<Quiescence::Report> results; // of rounds, on their way to it
+        std::deque<Quiescence::Report> results; // of rounds, on their way to this rank
         std::int64_t rounds = 0;
     };
 
@@ -103,7 +103,7 @@ private:
             ++r.sent;
             underWay_.push_back(any());
         }
-        if (pick(3) > 0) // else it goes on
+        if (pick(3) > 0) // otherwise it goes on
             --r.tasks;
     }
 
@@ -164,7 +164,7 @@ TEST_CASE("Whatever the order, nothing is said while something is under way, and
             FAIL("seed " << seed);
     }
     CHECK(claims == 5000);
-    CHECK(wrongRounds > 5); // or the orders are not bad enough to show anything
+    CHECK(wrongRounds > 5); // otherwise the orders are too easy
 }
 
 TEST_CASE("Where a message was lost nothing is said", "[quiescence]")
@@ -176,7 +176,7 @@ TEST_CASE("Where a message was lost nothing is said", "[quiescence]")
         lossless += o.claims > 0 && o.wrongClaims == 0;
     }
     CHECK(claims == lossless);
-    CHECK(claims < 150); // of those where none was
+    CHECK(claims < 150); // those in which no message was lost
 }
 
 TEST_CASE("It takes two rounds with the same sums, as many taken as sent, and a rank that waits", "[quiescence]")
@@ -201,7 +201,7 @@ TEST_CASE("It takes two rounds with the same sums, as many taken as sent, and a 
     CHECK_FALSE(says({reportOf(5, 5), reportOf(6, 5), reportOf(6, 6)}));
     CHECK_FALSE(says({reportOf(6, 5), reportOf(6, 5), reportOf(6, 5)}));
     CHECK_FALSE(says({reportOf(5, 6), reportOf(5, 6)}));
-    CHECK_FALSE(says({reportOf(5, 5), reportOf(5, 5, 0)})); // all are done: their verdict is on its way
+    CHECK_FALSE(says({reportOf(5, 5), reportOf(5, 5, 0)})); // all are done, so their verdict is on its way
     CHECK_FALSE(says({reportOf(5, 5), reportOf(5, 6), reportOf(5, 5)}));
 }
 

@@ -1,4 +1,4 @@
-// What ranks tell owners of their inputs, and what owners make of it.
+// Declarations: what ranks tell owners of their inputs, and what owners know from that.
 #include "catch.hpp"
 
 #include <dfb/error.hpp>
@@ -22,13 +22,13 @@ using Known = std::set<std::tuple<int, std::uint32_t, int, int>>; // tile, sourc
 constexpr int ranks = 3;
 int ownerOf(int tile, int shift = 0) { return (tile + shift) % ranks; }
 
-// All ranks at once; messages arrive as they are sent.
+// All ranks at once. Messages arrive immediately.
 struct Ranks {
     dfb::detail::Declarations of[ranks];
     std::vector<std::pair<int, int>> sent; // from, to
     int shift = 0, lastShift = 0;          // of the owners
 
-    // Returns what each owner knows in the end. The ranks from `declaring` on declare nothing: the frame fails.
+    // Returns what each owner knows in the end. Ranks from `declaring` on declare nothing, so the frame fails.
     std::vector<Known> frame(const std::vector<Inputs>& inputs, bool lastHolds = true, int declaring = ranks)
     {
         sent.clear();
@@ -92,13 +92,13 @@ TEST_CASE("Owners know what was declared, and only what they do not know yet is 
     inputs[0][0].source = 9; // for one owner
     CHECK(all.frame(inputs) == expectedOf(inputs));
     CHECK(all.sent == Sent{{0, 2}});
-    inputs[0].erase(inputs[0].begin()); // that one gets nothing more
+    inputs[0].erase(inputs[0].begin()); // that owner gets no more inputs
     CHECK(all.frame(inputs) == expectedOf(inputs));
     CHECK(all.sent == Sent{{0, 2}});
-    inputs[2] = {{0, 8, 0}, {1, 8, 0}, {4, 8, 0}, {2, 8, 0}}; // from one rank to another
+    inputs[2] = {{0, 8, 0}, {1, 8, 0}, {4, 8, 0}, {2, 8, 0}}; // inputs move from one rank to another
     inputs[1].clear();
     CHECK(all.frame(inputs) == expectedOf(inputs));
-    CHECK(all.sent == Sent{{2, 0}, {2, 1}}); // and itself
+    CHECK(all.sent == Sent{{2, 0}, {2, 1}}); // and to itself
     inputs = {{}, {}, {}};
     CHECK(all.frame(inputs) == expectedOf(inputs));
     CHECK(all.sent == Sent{{0, 1}, {2, 0}, {2, 1}});
@@ -115,7 +115,7 @@ TEST_CASE("If tiles have moved, their new owners are told, and the old ones that
     CHECK(all.frame(inputs) == expectedOf(inputs, 1));
     CHECK(all.sent.empty());
     all.shift = 2;
-    all.frame(inputs, true, 0); // nobody declares anything
+    all.frame(inputs, true, 0); // no rank declares anything
     CHECK(all.frame(inputs) == expectedOf(inputs, 2));
     CHECK(all.sent == Sent{{0, 1}, {0, 2}, {1, 0}, {1, 2}});
     all.shift = 0;
@@ -129,7 +129,7 @@ TEST_CASE("After a frame that failed everything is declared anew", "[declaration
     std::vector<Inputs> inputs{{{1, 7, 0}}, {{2, 8, 0}}, {{0, 9, 0}}};
     all.frame(inputs);
     std::vector<Inputs> others{{{1, 17, 0}}, {{2, 18, 0}}, {{0, 19, 0}}};
-    all.frame(others, true, 2); // two have told the owners, who have not all taken it
+    all.frame(others, true, 2); // two ranks have told owners, not all of which took it
     CHECK(all.frame(others, false) == expectedOf(others));
     CHECK(all.sent == Sent{{0, 1}, {1, 2}, {2, 0}});
     CHECK(all.frame(others) == expectedOf(others));

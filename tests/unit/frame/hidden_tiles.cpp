@@ -1,4 +1,4 @@
-// HiddenTiles: what cannot be seen, and what waits for word, whichever way the words overtake each other.
+// HiddenTiles: which inputs cannot be seen, and which wait for a message, in whatever order messages arrive.
 #include "catch.hpp"
 
 #include <dfb/frame/hidden_tiles.hpp>
@@ -36,7 +36,7 @@ TEST_CASE("An input waits for the word of those in front of it, and of no others
     tiles.take({0, 2, Word::Shows});
     CHECK_FALSE(tiles.isUndecided(0, 3));
     CHECK(tiles.isUndecided(0, 4));
-    tiles.take({0, 3, Word::Hides}); // by one that had not said that it may
+    tiles.take({0, 3, Word::Hides}); // hidden by one that had not sent MayHide
     CHECK_FALSE(tiles.isUndecided(0, 4));
     CHECK(tiles.from(0) == 3);
     tiles.newFrame(2);
@@ -50,7 +50,7 @@ TEST_CASE("A word that overtakes its announcement leaves nothing to wait for", "
     tiles.take({0, 1, Word::Shows});
     tiles.take({0, 1, Word::MayHide});
     CHECK_FALSE(tiles.isUndecided(0, 1));
-    tiles.take({0, 1, Word::MayHide}); // and another one is awaited
+    tiles.take({0, 1, Word::MayHide}); // so another message is awaited
     CHECK(tiles.isUndecided(0, 1));
 }
 

@@ -1,5 +1,5 @@
-// OpenFrame: every transition of its states, what belongs to which frame, and that closing waits for all who are
-// inside.
+// OpenFrame: every transition of its states, which messages and tiles belong to a frame, and that closing waits for all
+// threads that are inside.
 #include "catch.hpp"
 
 #include <dfb/error.hpp>
@@ -31,7 +31,7 @@ dfb::ErrorInfo errorOf(dfb::ErrorKind kind)
     return info;
 }
 
-// What a test can do to a frame.
+// All events of a frame.
 const std::vector<std::pair<const char*, std::function<void(OpenFrame&)>>> events{
     {"open", [](OpenFrame& f) { f.open(); }},
     {"finish", [](OpenFrame& f) { f.finish(); }},
@@ -44,7 +44,7 @@ const std::vector<std::pair<const char*, std::function<void(OpenFrame&)>>> event
     {"decide", [](OpenFrame& f) { f.decide(); }},
     {"close", [](OpenFrame& f) { f.close(noHelp); }}};
 
-// A frame in that state, by the shortest way.
+// A frame that was brought into a state in the shortest way.
 std::unique_ptr<OpenFrame> frameIn(FrameState state)
 {
     auto frame = std::make_unique<OpenFrame>();
@@ -120,24 +120,24 @@ TEST_CASE("What a failure says depends on whether this rank has voted, and who w
     CHECK_FALSE(frame.failed());
     auto failure = frame.fail(errorOf(dfb::ErrorKind::MalformedMessage));
     CHECK((failure.isFirst && failure.inTime && frame.failed() && frame.isDamaged()));
-    CHECK(frame.reason()->kind == dfb::ErrorKind::DuplicateInput); // what was noted came first
+    CHECK(frame.reason()->kind == dfb::ErrorKind::DuplicateInput); // the noted error came first
     failure = frame.fail(errorOf(dfb::ErrorKind::UserCode));
     CHECK((!failure.isFirst && failure.inTime));
     CHECK_FALSE(frame.vote(no, no));
     CHECK(frame.vote(no, yes));
-    CHECK_FALSE(frame.vote(yes, yes)); // once
+    CHECK_FALSE(frame.vote(yes, yes)); // only once
     CHECK_FALSE(frame.note(errorOf(dfb::ErrorKind::UserCode)));
     CHECK_FALSE(frame.fail(errorOf(dfb::ErrorKind::UserCode)).inTime);
     frame.close(noHelp);
-    CHECK(frame.failed()); // until the next
+    CHECK(frame.failed()); // until the next frame
     frame.open();
     CHECK((!frame.failed() && !frame.isDamaged() && !frame.reason()));
 
-    frame.failElsewhere(errorOf(dfb::ErrorKind::UserCode)); // which has told all
+    frame.failElsewhere(errorOf(dfb::ErrorKind::UserCode)); // that rank has told all
     CHECK_FALSE(frame.fail(errorOf(dfb::ErrorKind::UserCode)).isFirst);
     frame.close(noHelp);
 
-    frame.open(); // a failure after the vote stops what this rank does, and no more
+    frame.open(); // a failure after the vote only stops this rank's work
     frame.finish();
     CHECK(frame.vote(yes, yes));
     failure = frame.fail(errorOf(dfb::ErrorKind::UserCode));
@@ -153,21 +153,21 @@ TEST_CASE("A rank does not vote on a frame that has failed while it reads inputs
     CHECK(frame.beginReading(true)); // two threads
     frame.fail(errorOf(dfb::ErrorKind::UserCode));
     CHECK_FALSE(frame.vote(yes, yes));
-    CHECK_FALSE(frame.beginReading()); // nobody begins any more
+    CHECK_FALSE(frame.beginReading()); // no more reader may begin
     CHECK_FALSE(frame.endReading());
     CHECK_FALSE(frame.vote(yes, yes));
-    CHECK(frame.endReading()); // the last one is to try again
+    CHECK(frame.endReading()); // the last reader must try again
     CHECK(frame.vote(yes, yes));
     frame.close(noHelp);
 
-    frame.open(); // inputs that were copied may be read for long
+    frame.open(); // copied inputs may be read for long
     CHECK(frame.beginReading());
     frame.fail(errorOf(dfb::ErrorKind::TimedOut));
     CHECK(frame.vote(yes, yes));
     CHECK(frame.endReading());
     frame.close(noHelp);
 
-    frame.open(); // a good frame waits for its tiles, which is more
+    frame.open(); // a good frame waits for its tiles, not only for readers
     CHECK(frame.beginReading(true));
     frame.finish();
     CHECK_FALSE(frame.endReading());
@@ -253,7 +253,7 @@ TEST_CASE("Closing does itself what it waits for", "[open_frame]")
 TEST_CASE("Closing waits for work that somebody inside has begun meanwhile", "[open_frame]")
 {
     OpenFrame frame;
-    for (int number = 1; number <= 3; ++number) { // the count must be right again for the next
+    for (int number = 1; number <= 3; ++number) { // the count must be right again for the next frame
         frame.open();
         OpenFrame::Inside first = frame.enter(number);
         REQUIRE(first);

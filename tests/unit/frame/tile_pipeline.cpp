@@ -1,4 +1,4 @@
-// Inputs that an owner takes, and those that it refuses.
+// TilePipeline: which inputs in place an owner accepts.
 #include "catch.hpp"
 
 #include <dfb/frame/tile_pipeline.hpp>
@@ -14,7 +14,7 @@ namespace {
 
 using Op = dfb::BasicAlphaBlend<8>;
 
-// How an input in place ends, in a frame of one tile.
+// The outcome of an input in place, in a frame of one tile.
 std::string outcomeOf(const dfb::detail::OperationTraits& traits, dfb::WireFormat format)
 {
     namespace d = dfb::detail;

@@ -1,4 +1,4 @@
-// An owner's tiles: an operation that has thrown is not used again in that frame, whatever comes when.
+// TileTable: an operation that has thrown is not used again in that frame, whatever arrives when.
 #include "catch.hpp"
 
 #include <dfb/buffer.hpp>
@@ -18,7 +18,7 @@ namespace {
 
 enum Fault { None, InNewFrame, InAdd };
 
-// Throws for the last tile, in the first call of one kind, and counts what is called after that.
+// A stage that throws for the last tile, in the first call of one kind, and counts the calls after that.
 struct Stage final : dfb::detail::TileStage {
     Stage(Fault at, int& callsAfter) : fault(at), after(callsAfter) {}
 

@@ -1,4 +1,4 @@
-// ImageGate: writers get in while their frame is open, and who closes the gate knows that none is left.
+// ImageGate: writers can enter while their frame is open, and after the gate has closed no writer is inside.
 #include "catch.hpp"
 
 #include <dfb/gather/image_gate.hpp>
@@ -49,13 +49,13 @@ TEST_CASE("Nobody writes once the gate is closed", "[gather]")
     std::atomic<std::int64_t> frame{0};
     std::atomic<bool> over{false};
     std::atomic<int> written{0};
-    std::int64_t image = 0; // not atomic: the thread sanitizer sees who writes it when
+    std::int64_t image = 0; // not atomic, so that ThreadSanitizer finds races of writers
     std::atomic<int> turn{0};
     std::vector<std::thread> writers;
     for (int t = 0; t < 3; ++t)
         writers.emplace_back([&, t] {
             while (!over) {
-                if (turn != t) { // one at a time, as tiles are
+                if (turn != t) { // one at a time, as for tiles
                     std::this_thread::yield();
                     continue;
                 }

@@ -1,4 +1,4 @@
-// growthOfM2: sums of squared deviations do not drift, and do not cancel.
+// growthOfM2: sums of squared deviations neither drift nor cancel.
 #include "catch.hpp"
 
 #include <dfb/ops/progressive.hpp>
@@ -15,7 +15,7 @@ namespace {
 
 using Sample = std::array<double, 4>;
 
-// What Progressive keeps of a pixel.
+// The sums that Progressive keeps for each pixel.
 struct Sums {
     std::int64_t count = 0;
     Sample sum{};

@@ -1,4 +1,5 @@
-// The tile operations against the serial reference: adversarial fragments, through the wire, in every arrival order.
+// The tile operations against the serial reference: adversarial fragments, sent through the wire format, in every
+// arrival order.
 #include "catch.hpp"
 
 #include <dfb/ops/image_parallel.hpp>
@@ -32,7 +33,7 @@ using dfb::testing::TileInputs;
 using dfb::testing::TileOutput;
 using dfb::testing::uniform;
 
-// Of a user's: the image is white where any input has a depth.
+// A user's operation: the image is white where any input has a depth.
 struct HasDepth {
     static constexpr int tileSize = 8;
     static constexpr dfb::ChannelMask channels = dfb::colorChannel | dfb::depthChannel;
@@ -69,7 +70,7 @@ dfb::testing::ErrorReport compare(const TileInputs<Op::tileSize>& in)
     return dfb::testing::compare<Op>(in, dfb::testing::referenceOf(in));
 }
 
-// Pixels of 8 bits a channel, and the same as floats.
+// An input with 8 bits a channel, and the same pixels as floats.
 struct ByteInput {
     std::vector<std::uint8_t> bytes = std::vector<std::uint8_t>(4 * 50 * 20);
     std::vector<float> floats, depth = std::vector<float>(50 * 20), normal = std::vector<float>(3 * 50 * 20, 0.5f);
@@ -110,7 +111,7 @@ struct ByteOutput {
     std::int64_t faults = 0;
 };
 
-// Composites them as bytes, which stay so until finish(), or as floats.
+// Composites the inputs as bytes, which stay unchanged until finish(), or as floats.
 template <class Op>
 ByteOutput runBytes(const std::vector<ByteInput>& inputs, const dfb::TileInfo& info, bool asBytes,
                     dfb::OutputFormat format, bool dither)
@@ -205,11 +206,12 @@ TEST_CASE("AlphaBlend is within 1 ulp of exact in float, exact in 8 bits and in 
             for (int i = 0; i < 3; ++i) {
                 INFO("seed " << seed << ", " << layers << " layers, " << passes << " passes");
                 const ErrorReport c = compare<dfb::BasicAlphaBlend<8>>(adversarial<8>(seed++, layers, passes));
-                // One: two roundings, to double on the way and to float, can both go the wrong way at a tie.
+                // The bound is 1 ulp: two roundings, to double on the way and to float, can both go the wrong way at a
+                // tie.
                 CHECK(c.ulpsBelow() <= 2);
                 CHECK(c.wrongBytes == 0);
             }
-    // Wide enough for the fast path that finds out how far an order holds.
+    // Rows wide enough for the fast path that finds how far an order holds.
     for (int layers : {2, 4, 7}) {
         INFO("seed " << seed << ", " << layers << " layers of 64x64");
         const ErrorReport c = compare<dfb::AlphaBlend>(adversarial<64>(seed++, layers, 1));
@@ -224,7 +226,7 @@ TEST_CASE("DepthComposite is within 1 ulp of exact in float, exact in 8 bits and
     for (std::uint64_t seed = 300; seed < 340; ++seed) {
         auto in = adversarial<8>(seed, 1 + static_cast<int>(seed % 9), 1 + static_cast<int>(seed % 3));
         Random random(seed);
-        for (const auto& tile : in.tiles) // without colour, without a depth, with one that is none
+        for (const auto& tile : in.tiles) // without colour, without depth, with a NaN depth
             for (int i = 0; i < 64; ++i) {
                 if (random() % 4 == 0)
                     std::fill_n(tile->color + 4 * i, 4, 0.0f);
@@ -327,7 +329,7 @@ TEST_CASE("Equal depths are decided by source, then part", "[ops]")
 
 TEST_CASE("4096 thin layers at one pixel", "[ops]")
 {
-    // Where single-precision accumulation is hundreds of ulps off.
+    // In single precision, accumulation would be off by hundreds of ulps.
     for (const float alpha : {1.0f / 4096.0f, 0x1p-20f, 0.01f}) {
         Random random(7);
         TileInputs<8> in;
@@ -386,7 +388,7 @@ TEST_CASE("Exact cases by hand", "[ops]")
     }
     SECTION("8 bits round ties to even")
     {
-        // 0.5 * 255 = 127.5: the only tie that floats can make.
+        // 0.5 * 255 = 127.5 is the only tie that floats can produce.
         TileInputs<8> in;
         in.add(0, 0).fill({0.5f, std::nextafter(0.5f, 0.0f), std::nextafter(0.5f, 1.0f), 0.25f}, 0.0f);
         const TileOutput out = dfb::testing::runTileOp<Blend>(in, {0}, dfb::OutputFormat::RGBA8);
@@ -397,7 +399,7 @@ TEST_CASE("Exact cases by hand", "[ops]")
     }
     SECTION("passes are composited each by itself, then averaged")
     {
-        // Two bricks that cover the same half of a pixel: pass 0 both, pass 1 neither.
+        // Two bricks that cover the same half of a pixel: both are hit in pass 0, neither in pass 1.
         TileInputs<8> in;
         in.passes = 2;
         in.background = {0, 0, 1, 1};
@@ -454,8 +456,8 @@ TEST_CASE("What is not finite spoils its own pixel and is counted", "[ops]")
                     changedElsewhere += dfb::testing::ulpsBetween(out.value(4 * i + c), clean.value(4 * i + c)) != 0
                                         || out.depth[i] != clean.depth[i];
         CHECK(changedElsewhere == 0);
-        // At the pixel itself the rule is arithmetic's own; the reference follows it (and treats a NaN depth as
-        // farthest).
+        // At the damaged pixel the result follows from the arithmetic. So does the reference, in which a NaN depth is
+        // farthest.
         const auto expected = dfb::testing::referenceOf(in);
         for (std::size_t c = 0; c < 4; ++c)
             CHECK(dfb::testing::ulpsBetween(out.value(4 * pixel + c), dfb::testing::toFloat(expected[pixel].rgba[c]))
@@ -480,7 +482,7 @@ TEST_CASE("What is not finite spoils its own pixel and is counted", "[ops]")
 
 TEST_CASE("8 bits are the exact result rounded also next to a tie", "[ops]")
 {
-    // Nearly opaque layers: alpha is 1/2 less something far below the last bit of a double, or more.
+    // Nearly opaque layers: alpha is 1/2 minus something far below the last bit of a double, or plus it.
     for (const bool above : {false, true})
         for (const int passes : {1, 2, 3}) {
             TileInputs<8> in;
@@ -489,7 +491,7 @@ TEST_CASE("8 bits are the exact result rounded also next to a tie", "[ops]")
                 for (std::uint32_t source = 0; source < 5; ++source) {
                     auto& tile = in.add(pass, source);
                     for (int i = 0; i < 64; ++i) {
-                        // 1 - 2^-24 five times lets 2^-120 through: too little even for this.
+                        // Five times 1 - 2^-24 lets 2^-120 through, which is too little even for this test.
                         const float alpha = source < 3 ? 0x1p-24f * static_cast<float>(i % 7) : 0.5f;
                         tile.depth[i] = static_cast<float>(source);
                         tile.color[4 * i] = source == 0 ? (above ? 1 : -1) * 0x1p-70f : source == 3 ? 0.5f : 0.0f;
@@ -504,7 +506,7 @@ TEST_CASE("8 bits are the exact result rounded also next to a tie", "[ops]")
 
 TEST_CASE("A tie in a row does not change the levels of other pixels", "[ops]")
 {
-    // The level of red at a pixel with these layers of red and alpha, beside one of 1/2, a tie, or of 0.3.
+    // The level of red at a pixel with these layers of red and alpha. Its neighbour has 1/2, which is a tie, or 0.3.
     const auto levelBeside = [](float neighbour, const std::vector<std::array<float, 2>>& layers, float least) {
         TileInputs<8> in;
         for (std::size_t i = 0; i < layers.size(); ++i) {
@@ -519,7 +521,7 @@ TEST_CASE("A tie in a row does not change the levels of other pixels", "[ops]")
         return dfb::testing::runTileOp<dfb::BasicAlphaBlend<8>>(in, in.order(), dfb::OutputFormat::RGBA8, true, wire)
             .color[0];
     };
-    // Less than 1/100 comes through the first three, so that the last is left out, with all its light.
+    // The first three layers let less than 1/100 through, so the last one is left out, with all its light.
     const std::vector<std::array<float, 2>> cut{{0.1f, 0.91f}, {0.1f, 0.73f}, {0.1f, 0.67f}, {1e25f, 0.5f}};
     CHECK(levelBeside(0.5f, cut, 0.01f) == levelBeside(0.3f, cut, 0.01f));
     const std::vector<std::array<float, 2>> infinite{{infinity, 0.25f}, {0.25f, 0.25f}};
@@ -528,7 +530,7 @@ TEST_CASE("A tie in a row does not change the levels of other pixels", "[ops]")
 
 TEST_CASE("Where colour is dithered alpha is the exact result rounded all the same, and not exceeded", "[ops]")
 {
-    // Alpha is 1/2, a tie, less something far below the last bit of a double.
+    // Alpha is 1/2, which is a tie, minus something far below the last bit of a double.
     TileInputs<8> in;
     in.add(0, 0).fill({0, 0, 0, -0x1p-70f}, 0);
     in.add(0, 1).fill({0.5f, 0.49f, 0, 0.5f}, 1);
@@ -549,7 +551,7 @@ TEST_CASE("OrderedBlend does not wait for what an opaque input hides, nor take i
 {
     using Op = dfb::BasicOrderedBlend<8>;
     constexpr int inputs = 5;
-    // A bit for each input that is opaque; the others have a hole, or let something through.
+    // One bit for each input that is opaque. The others have a hole or let something through.
     for (unsigned opaque = 0; opaque < 1u << inputs; ++opaque) {
         TileInputs<8> in;
         for (int g = 0; g < inputs; ++g) {
@@ -561,11 +563,11 @@ TEST_CASE("OrderedBlend does not wait for what an opaque input hides, nor take i
             tile.generation = g;
             tile.children = g + 1 < inputs;
         }
-        int first = 0; // that is opaque
+        int first = 0; // the first opaque input
         while (first < inputs && !((opaque >> first) & 1))
             ++first;
         if (first + 1 < inputs)
-            in.tiles.back()->pixel(0, 0)[0] = infinity; // which would show
+            in.tiles.back()->pixel(0, 0)[0] = infinity; // would show if it were taken
         auto expected = [&] {
             auto order = in.order();
             order.resize(std::min<std::size_t>(order.size(), static_cast<std::size_t>(first) + 1));
@@ -615,7 +617,7 @@ TEST_CASE("OrderedBlend does not take two inputs for the two that an opaque one 
         do {
             Op op;
             const auto run = [&] { dfb::testing::runTileOp(op, in, order, dfb::OutputFormat::RGBA32F, false); };
-            if (isFirst) { // or they were declared; if not, the dependency tracker finds it
+            if (isFirst) { // or declared; else the dependency tracker finds it
                 run();
                 CHECK_FALSE(op.isComplete());
             } else {

@@ -1,4 +1,4 @@
-// Cameras with lenses, two eyes, domes and motion: no ray meets a box in a tile that the projection leaves out.
+// Cameras with lenses, two eyes, domes and motion: no ray meets a box in a tile that the box's projection leaves out.
 #include "catch.hpp"
 
 #include <dfb/render/cameras.hpp>

@@ -1,4 +1,4 @@
-// World, camera and visibility: a projection covers whatever rays can meet of a box.
+// World, camera and visibility: the projection of a box covers all pixels whose rays can meet the box.
 #include "catch.hpp"
 
 #include <dfb/dfb.hpp>

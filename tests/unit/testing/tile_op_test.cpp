@@ -1,5 +1,5 @@
-// checkTileOp(): finds nothing wrong with good operations, and each thing that a bad one does wrong. PassImages, and
-// the ways to walk pixels that operations and renderers have.
+// checkTileOp(): it finds no fault in good operations, and each fault of bad ones. PassImages, and the ways in which
+// operations and renderers walk pixels.
 #include "catch.hpp"
 
 #include <dfb/ops/sort_last.hpp>
@@ -19,7 +19,7 @@ using dfb::testing::checkTileOp;
 
 enum class Fault { None, ArrivalOrder, OldState, OtherMean, NoBackground };
 
-// Of each pass the input with the largest alpha; or what it should be, but for a fault.
+// In each pass, keeps the input with the largest alpha. With a fault, it does so wrongly.
 template <Fault fault>
 class Strongest {
 public:
@@ -59,7 +59,7 @@ private:
     int passes_ = 1;
 };
 
-// Forgets its last row.
+// An operation that does not write its last row.
 struct MissesRow {
     static constexpr int tileSize = 16;
     static constexpr dfb::ChannelMask channels = dfb::colorChannel;

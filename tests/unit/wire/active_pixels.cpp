@@ -1,5 +1,4 @@
-// ActivePixels: which pixels of a row are active, and the check of what is copied; the fast loops beside the plain
-// ones.
+// ActivePixels: which pixels of a row are active, and the check of copied pixels. Fast loops equal plain ones.
 #include "catch.hpp"
 
 #include <dfb/wire/active_pixels.hpp>

@@ -1,5 +1,5 @@
-// FinishedRecord: tiles come out as they went in, take no more than what is not background, and nothing malformed gets
-// through.
+// FinishedRecord: tiles come out as they went in, take little more than their pixels that are not background, and
+// malformed records are refused.
 #include "catch.hpp"
 
 #include <dfb/wire/finished_record.hpp>
@@ -21,7 +21,7 @@ using d::FinishedRecord;
 constexpr int side = 32, width = 70, height = 45; // the tiles at the border are 6 by 13
 const dfb::TileLayout layout(width, height, side);
 
-// The planes of an image, or of a tile.
+// The planes of an image or of a tile.
 struct Pixels {
     Pixels(const FinishedRecord& record, std::size_t count, std::size_t stride)
     {
@@ -35,7 +35,7 @@ struct Pixels {
     d::FinishedPlanes planes;
 };
 
-// Pixels by their number in the tile; `isBackground(x, y)` says which are alike.
+// A tile whose pixels have different values; those for which `isBackground(x, y)` holds are all equal.
 template <class IsBackground>
 Pixels makeTile(const FinishedRecord& record, const dfb::Region& region, const IsBackground& isBackground)
 {
@@ -60,7 +60,7 @@ std::vector<std::byte> recordOf(const FinishedRecord& record, int tile, const Pi
     return bytes;
 }
 
-// True if the tile is in the image, and nothing else has been touched.
+// Whether the tile arrives in the image and nothing else is changed.
 bool arrives(const FinishedRecord& record, int tile, const Pixels& pixels, const std::vector<std::byte>& bytes)
 {
     Pixels image(record, static_cast<std::size_t>(width) * height, width);
@@ -109,12 +109,12 @@ TEST_CASE("A finished tile arrives as it was, and its background does not travel
                         CHECK(arrives(record, tile, pixels, bytes));
                         return bytes.size();
                     };
-                    // Nothing but the header, the pixel and the counts of the rows.
+                    // The record has only the header, the pixel and the counts of the rows.
                     CHECK(bytesWith([](int, int) { return true; })
                           <= 16 + each + 2 * static_cast<std::size_t>(region.height()) + 15);
                     CHECK(bytesWith([](int, int) { return false; }) > most * 9 / 10); // some are alike by chance
                     CHECK(bytesWith([](int, int) { return false; }) <= most);
-                    // A pixel more is not much more.
+                    // One different pixel adds little.
                     CHECK(bytesWith([](int x, int y) { return x != 3 || y != 5; })
                           <= 16 + 2 * each + 4 + 2 * static_cast<std::size_t>(region.height()) + 15);
                     CHECK(bytesWith([](int x, int) { return x < 4; }) < most);
@@ -141,7 +141,7 @@ TEST_CASE("Finished tiles that are malformed are refused or stay within their ti
                     bytes[which ? random() % 16 : bytes.size() - 1 - random() % std::min(tail, bytes.size())] =
                         static_cast<std::byte>(random());
                 }
-                // As much room as the tile that is named has, and no more: AddressSanitizer looks on.
+                // The target has exactly the size of the named tile, so that AddressSanitizer finds writes beyond it.
                 try {
                     Pixels target(record, 1, 1);
                     record.read(bytes.data(), bytes.size(), layout, [&](int tile, const dfb::Region& r) {

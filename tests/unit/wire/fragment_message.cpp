@@ -1,4 +1,5 @@
-// The wire format: tiles there and back, encodings, compression, and bytes that are no message.
+// The wire format: tiles are unchanged after encoding and decoding, in all encodings and with compression, and bytes
+// that are not a message are refused.
 #include "catch.hpp"
 
 #include <dfb/wire/fragment_message.hpp>

@@ -1,4 +1,5 @@
-// Sparse planes: spans and planes come back as they were, whatever the region, and what no sender makes is refused.
+// Sparse planes: spans and planes are unchanged after encoding and decoding, whatever the region, and invalid ones are
+// refused.
 #include "catch.hpp"
 
 #include <dfb/wire/sparse_planes.hpp>
@@ -25,7 +26,7 @@ using dfb::FragmentEncoding;
 
 constexpr float notANumber = std::numeric_limits<float>::quiet_NaN();
 
-// Of pixels by their number in the region, row by row.
+// The spans of the active pixels, which are numbered row by row in the region.
 d::ActiveSpans spansOf(const dfb::Region& region, const std::vector<bool>& isActive)
 {
     d::ActiveSpans active;
@@ -43,7 +44,7 @@ d::ActiveSpans spansOf(const dfb::Region& region, const std::vector<bool>& isAct
     return active;
 }
 
-// Why it is refused, or "".
+// The error of `call`, or "".
 template <class Call>
 std::string refusal(const Call& call)
 {
@@ -151,7 +152,7 @@ TEST_CASE("Planes that were split come back", "[wire]")
     check(std::uint32_t{}, std::integral_constant<std::size_t, 1>());
 }
 
-// What other versions of the library would read: the layout must not change unnoticed.
+// Other versions of the library read this layout, so it must not change unnoticed.
 TEST_CASE("A plane is split into differences to the pixel before, then into bytes", "[wire]")
 {
     const std::uint16_t in[] = {1, 2, 3, 0x400, 3, 1, 3, 0x300}; // two pixels

@@ -1,5 +1,5 @@
-// Wire formats: conversions to the nearest, bounds that hold and are not far from what happens, the choice within a
-// budget, and what is compressed.
+// Wire formats: conversions to the nearest value, error bounds that hold and are not much too large, the choice of a
+// format within a budget, and which tiles are compressed.
 #include "catch.hpp"
 
 #include <dfb/ops/image_parallel.hpp>
@@ -50,7 +50,7 @@ dfb::Precision precisionOf(WireFormat format, float maxColor = 1)
     return precision;
 }
 
-// The nearest of the binary16 numbers next to a half, ties to even, in double.
+// The nearest binary16 number, with ties to even, computed in double. `guess` is at most two numbers off.
 std::uint16_t nearestHalf(float value, std::uint16_t guess)
 {
     std::uint16_t best = guess;
@@ -83,7 +83,7 @@ TEST_CASE("Half precision: every number from 0 on comes back, and floats become 
     for (int i = 0; i < 200000; ++i) {
         const auto half = static_cast<std::uint16_t>(random() % 0x7bff);
         const float low = positiveFromHalf(half), high = positiveFromHalf(static_cast<std::uint16_t>(half + 1));
-        // In between, in the middle, next to the middle.
+        // Values between two numbers, in the middle, and next to the middle.
         const float middle = low + 0.5f * (high - low);
         for (const float value : {low + uniform(random) * (high - low), middle, std::nextafter(middle, 0.0f),
                                   std::nextafter(middle, infinity)})
@@ -110,7 +110,7 @@ TEST_CASE("Colours become the nearest of their format", "[wire_format]")
             }
             REQUIRE(coder.inRange(rgba.data(), static_cast<int>(rgba.size() / 4)));
             const std::vector<float> result = through(format, coder, rgba);
-            double worst = 0; // in units of what is allowed
+            double worst = 0; // in units of the allowed error
             for (std::size_t i = 0; i < rgba.size(); ++i) {
                 const auto value = static_cast<double>(rgba[i]);
                 const double largest = i % 4 == 3 ? 1.0 : static_cast<double>(maxColor);
@@ -120,9 +120,9 @@ TEST_CASE("Colours become the nearest of their format", "[wire_format]")
                 worst = std::max(worst, std::abs(static_cast<double>(result[i]) - value) / allowed);
             }
             CHECK(worst <= 1);
-            CHECK(worst > 0.9); // it does happen
+            CHECK(worst > 0.9); // the bound is nearly reached
         }
-    // Colours of 0, alphas of 1 and numbers of 8 bits stay what they are.
+    // Colours of 0, alphas of 1 and 8-bit values do not change.
     const dfb::detail::WireCoder coder(precisionOf(WireFormat::Unorm8));
     for (int level = 0; level <= 255; ++level) {
         const float value = static_cast<float>(level) / 255;
@@ -159,7 +159,8 @@ TEST_CASE("The bound of a format holds for 2, 64 and 4096 layers, and is not far
                 double worst = 0;
                 Random random(static_cast<std::uint64_t>(layers));
                 for (int pixel = 0; pixel < (layers > 1000 ? 300 : 3000); ++pixel) {
-                    // Thin layers just beside a tie, all rounded the same way; or at the ends; or anything.
+                    // Kinds of pixels: thin layers just beside a tie, all rounded the same way; extreme values; any
+                    // values.
                     const int kind = pixel % 6;
                     const double step = format == WireFormat::Unorm8 ? 1.0 / 255 : 1.0 / 65535;
                     const float thin = static_cast<float>((kind == 0 ? 0.499 : 0.501) * step);
@@ -169,7 +170,7 @@ TEST_CASE("The bound of a format holds for 2, 64 and 4096 layers, and is not far
                                             : kind < 4  ? (1.0f + 0x1p-11f * (kind == 2 ? 0.99f : 1.01f)) * 0x1p-6f
                                             : kind == 4 ? dfb::testing::anyAlpha(random)
                                                         : uniform(random) * 2 / static_cast<float>(layers);
-                        // In front black, behind bright: what is let through too much shows most.
+                        // Black in front and bright behind, as then an error of what is let through shows most.
                         const float bright = i < layers / 2 ? static_cast<float>(pixel / 6 % 2) : 1.0f;
                         for (int c = 0; c < 3; ++c)
                             rgba.push_back(
@@ -193,7 +194,7 @@ TEST_CASE("The bound of a format holds for 2, 64 and 4096 layers, and is not far
                 INFO(dfb::nameOf(format) << ", " << layers << " layers, colours up to " << maxColor << ": " << worst
                                          << " of " << bound);
                 CHECK(worst <= bound);
-                if (layers == 2) // with more, what is in front hides what is behind
+                if (layers == 2) // with more layers, those in front hide those behind
                     CHECK(worst > 0.2 * bound);
             }
         }
@@ -243,7 +244,7 @@ TEST_CASE("The image's depth is the same in any format, however thin a layer is"
             const auto image = dfb::testing::adversarial<16>(seed, 1, 2, true, true);
             CHECK(changedDepths<dfb::BasicImageParallel<16>>(image, format) == 0);
         }
-        // Alphas that are rounded to 0 in each format, before something solid.
+        // Alphas that each format rounds to 0, in front of something solid.
         dfb::testing::TileInputs<16> in;
         Tile& front = in.add(0, 0);
         const float alphas[] = {1e-3f, 1e-6f, 1e-13f, 1e-45f};
@@ -280,7 +281,7 @@ TEST_CASE("Tiles in lossy formats are within the bound, those out of range are e
             CHECK(worst <= dfb::wireErrorBound(format, layers, 1, 1) + 0x1p-23);
             CHECK(out.bytes <= exact.bytes);
         }
-    // Emission has no alpha that its colour could be within.
+    // Emissive colours are above their alpha.
     dfb::testing::TileInputs<16> in;
     auto& tile = in.add(0, 1);
     for (int i = 0; i < 16 * 16; ++i)
@@ -344,7 +345,7 @@ TEST_CASE("Compression changes nothing, in any format", "[wire_format]")
 
 } // namespace wire_format_cases
 
-// WireCodes: rows have the codes and values, bit for bit, that numbers alone have.
+// WireCodes: rows have the same codes and values, bit for bit, as single values.
 namespace wire_codes_cases {
 
 namespace {
@@ -353,7 +354,7 @@ using namespace dfb::detail; // NOLINT: all of it is looked at
 
 constexpr float infinity = std::numeric_limits<float>::infinity();
 
-// Floats from 0 to `most`: codes and ties between two by `step`, and their neighbours; denormals; any.
+// Floats from 0 to `most`: codes and ties between them, with their neighbours; denormals; any values.
 std::vector<float> floatsUpTo(float most, const std::vector<double>& ties)
 {
     std::vector<float> values{0.0f, -0.0f, 0x1p-149f, 0x1p-126f, 0x1p-25f, 0x1p-24f, 0x1p-14f, most};
@@ -377,7 +378,7 @@ std::vector<float> floatsUpTo(float most, const std::vector<double>& ties)
     return values;
 }
 
-// Where neighbouring halves up to 2^15 are equally near, and the halves.
+// The middles between neighbouring halves up to 2^15, and the halves themselves.
 std::vector<double> tiesOfHalves()
 {
     std::vector<double> ties;
@@ -396,7 +397,7 @@ std::vector<double> tiesOfIntegers(int most)
     return ties;
 }
 
-// Pixels as they come, encoded with scales of 1, all in one and in rows of any width and alignment.
+// Encodes arbitrary pixels with scales of 1, all at once and in rows of any width and alignment.
 template <class Code>
 int wrongEncoded(const std::vector<float>& values)
 {
@@ -427,7 +428,7 @@ int wrongEncoded(const std::vector<float>& values)
     return wrong;
 }
 
-// All of the first `count` codes, and rows of any width and alignment.
+// Decodes the first `count` codes, all at once and in rows of any width and alignment.
 template <class Code>
 int wrongDecoded(std::size_t count)
 {
@@ -439,7 +440,7 @@ int wrongDecoded(std::size_t count)
         std::memcpy(bytes.data() + i * sizeof word, &word, sizeof word);
     }
     int wrong = 0;
-    const auto check = [&](std::size_t first, int pixels) { // not at the start of a word: as bytes they are as good
+    const auto check = [&](std::size_t first, int pixels) { // begins within a word, which must work as well
         std::vector<float> fast(4 * static_cast<std::size_t>(pixels) + 8, -7), plain(fast);
         const bool plainIn = decodePixels<Code>(bytes.data() + first, pixels, by, plain.data());
         const bool fastIn = cpuHasF16c() ? decodePixelsAvx2<Code>(bytes.data() + first, pixels, by, fast.data())
