@@ -1,8 +1,9 @@
 #!/bin/sh
 # sh bench/get_icet.sh [DIR]
 # Puts IceT's headers and library into DIR/include and DIR/lib (default: build/peers/icet, where the build looks for
-# them), for benchmarks to compare with. They come out of Debian's packages of ParaView, which are downloaded (70 MB)
-# and unpacked, but not installed. Does nothing if IceT is there already; exits with 3 if the packages cannot be had.
+# them), so that benchmarks can compare with IceT. They are taken from Debian's packages of ParaView, which are
+# downloaded (70 MB) and unpacked, but not installed. Does nothing if IceT is there already; exits with 3 if the
+# packages are not available.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
@@ -14,7 +15,7 @@ give_up() {
     exit 3
 }
 
-# DIR is renamed into place when it is complete.
+# A new folder is renamed to DIR when it is complete.
 [ -e "$dir/include/IceT.h" ] && exit 0
 [ ! -e "$dir" ] || give_up "$dir is there, but has no include/IceT.h"
 for command in apt-get dpkg; do

@@ -1,17 +1,17 @@
 #!/bin/sh
 # sh bench/run.sh [--quick] [--launcher CMD]
-# Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs all
-# benchmarks but bench_messaging and bench_gather: tables, figures and pictures go to bench/results. An hour, or 8 minutes
-# with --quick. With --launcher bench_compositing also runs on several hosts: CMD, in front of a program, starts it there,
-# at best 4 ranks, one on each host.
-# The exit status is 1 if what bench_scaling and bench_skip count is not what it should be.
+# Installs what is missing, builds the preset "release", gets IceT to compare with, if it is available, and runs all
+# benchmarks except bench_messaging and bench_gather. Tables, figures and pictures go to bench/results. Takes an hour,
+# or 8 minutes with --quick. With --launcher, bench_compositing also runs on several hosts: CMD, in front of a program,
+# starts it there, ideally as 4 ranks, one on each host. The exit status is 1 if the counts of bench_scaling or
+# bench_skip are wrong.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
 frames=41 compositing_frames=11 views=12 skip_size=4096x4096 paper_views=8 paper_sizes=256x256,512x512 quick=
 launcher=
-# Each kind of system in its fastest ways
+# The fastest variants of each system
 main_rows="limit|defaults|in order, float32, to|in order, float32, all in place|in order, bytes, all in place|in order, unorm8|direct|sequential, radix-k,|sequential, tree"
 while [ $# -gt 0 ]; do
     case $1 in
@@ -57,7 +57,7 @@ python=python3
 "$python" bench/compositing/plot_error_time.py "$results/error_time.json" "$results" ||
     echo "run.sh: no pictures of error against time: they need python3 with matplotlib"
 
-# What has been measured at one size tells most; the others show whether it holds.
+# The measurement at one size tells most; the others show whether it holds in general.
 for ranks in 2 3 4 8 16; do
     mpiexec -n "$ranks" "$bench"/bench_compositing --scene all --size 1024x1024 \
         --frames "$compositing_frames" --commit "$commit" \

@@ -1,5 +1,5 @@
-# cpack -G DEB in the build folder makes libdfb-dev_<version>_all.deb: for all processors, as nothing in it is compiled,
-# dfb::compiled neither. It depends on what the headers of the components need that this build has.
+# cpack -G DEB in the build folder makes libdfb-dev_<version>_all.deb. It is for all processors, as nothing in it is
+# compiled, not even dfb::compiled. It depends on the packages that the headers of this build's components need.
 set(CPACK_PACKAGE_CONTACT "the maintainers of dfb <maintainers@dfb.invalid>")
 set(CPACK_PACKAGE_DESCRIPTION_SUMMARY "Distributed rendering: the tiles of many ranks become one image (headers)")
 set(CPACK_RESOURCE_FILE_LICENSE ${PROJECT_SOURCE_DIR}/LICENSE)

@@ -1,10 +1,11 @@
-# What our own tests and programs are compiled with. Nothing of it reaches a user's targets.
+# Flags and targets for our own tests and programs. They do not affect a user's targets.
 # dfb_developer_flags    warnings, and results that do not depend on the compiler
 # dfb_developer          these, and the library, compiled once unless DFB_DEVELOP_HEADER_ONLY
 # dfb_developer_headers  these, and the library as headers alone
 option(DFB_DEVELOP_HEADER_ONLY "Compile dfb's own tests and programs without dfb::compiled" OFF)
 
-# GCC would spend 10 to 30 % of its time on saving memory. Without that a file of ours takes up to 1.5 GB, not 1.2.
+# GCC would spend 10 to 30 % of its time on saving memory. Without that, a file of ours takes up to 1.5 GB instead of
+# 1.2.
 set(DFB_QUICK_COMPILE "")
 if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
   set(DFB_QUICK_COMPILE --param=ggc-min-heapsize=1000000) # in kB: what it may use before it looks for garbage
@@ -29,14 +30,14 @@ else()
   target_link_libraries(dfb_developer INTERFACE dfb_developer_flags dfb::compiled dfb::testing)
 endif()
 
-# Where bench/get_icet.sh puts IceT, for the adapter in its place, for its test and for benchmarks.
+# The folder into which bench/get_icet.sh puts IceT, for its adapter, for tests of the adapter, and for benchmarks.
 set(DFB_ICET_DIR ${PROJECT_SOURCE_DIR}/build/peers/icet CACHE PATH "IceT: where include/IceT.h and lib are")
 
-# dfb.hpp is parsed once for all programs that have the same flags: half of what a small one takes to compile. A file that
-# forgets a header may compile all the same; the preset clang, which does without, finds it.
+# dfb.hpp is parsed once for all programs that have the same flags, which saves half of the compile time of a small one.
+# A file that forgets an include may then compile all the same; the preset clang, without precompiling, finds it.
 option(DFB_PRECOMPILE "Precompile dfb.hpp for dfb's own tests and programs" OFF)
 
-# _dfb_reuse(<folder>): its targets, and those of the folders below
+# _dfb_reuse(<folder>): handles the targets of a folder and of those below it
 function(_dfb_reuse folder)
   get_property(targets DIRECTORY ${folder} PROPERTY BUILDSYSTEM_TARGETS)
   foreach(target IN LISTS targets)
@@ -63,7 +64,8 @@ function(_dfb_reuse folder)
   endforeach()
 endfunction()
 
-# Call it when all targets are there. With ccache it does nothing, as ccache does not keep what uses a precompiled header.
+# Call it when all targets exist. With ccache it does nothing, as ccache does not cache files that use a precompiled
+# header.
 function(dfb_precompile)
   if(NOT DFB_PRECOMPILE OR CMAKE_CXX_COMPILER_LAUNCHER)
     return()

@@ -1,5 +1,5 @@
-# Target docs: a site of docs/ and the headers, in <build>/site/html. A warning of Doxygen, or a link that leads nowhere, is
-# an error. Doxygen 1.9.1 or later; with doxygen-awesome-css it looks better.
+# Target docs: makes a site of docs/ and the headers in <build>/site/html. A warning of Doxygen or a broken link is an
+# error. Needs Doxygen 1.9.1 or later; looks better with doxygen-awesome-css.
 find_package(Doxygen 1.9.1 QUIET)
 if(NOT DOXYGEN_FOUND)
   return()
@@ -11,7 +11,7 @@ if(NOT DFB_SITE_STYLE)
   set(DFB_SITE_STYLE "")
 endif()
 
-# A page for each example that is one file, or the main file of its folder
+# A page for each example that is a single file, or for the main file of its folder
 file(GLOB examples CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/examples/*.cpp ${PROJECT_SOURCE_DIR}/examples/tachyon/*.cpp
   ${PROJECT_SOURCE_DIR}/examples/vtk/*.cpp ${PROJECT_SOURCE_DIR}/examples/adapters/c/minimal.c
   ${PROJECT_SOURCE_DIR}/examples/adapters/c/heat.f90)

@@ -1,9 +1,9 @@
-# Install rules. Each component has an export of its own, so that a user's find_package(dfb COMPONENTS core)
-# looks for nothing but what core needs.
+# Install rules. Each component has an export of its own, so that find_package(dfb COMPONENTS core) of a user looks only
+# for what core needs.
 include(GNUInstallDirs)
 include(CMakePackageConfigHelpers)
 
-# Headers are the same on all processors, and so is what is installed.
+# Headers are the same on all processors, and so are all installed files.
 set(_dfb_config_dir ${CMAKE_INSTALL_DATADIR}/cmake/dfb)
 target_include_directories(dfb_core INTERFACE $<INSTALL_INTERFACE:${CMAKE_INSTALL_INCLUDEDIR}>)
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/include/dfb DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}
@@ -18,7 +18,7 @@ foreach(_dfb_component IN LISTS DFB_COMPONENTS)
     DESTINATION ${_dfb_config_dir})
 endforeach()
 
-# Only by cmake --install <build> --component testing.
+# Installed only by cmake --install <build> --component testing.
 target_include_directories(dfb_testing INTERFACE $<INSTALL_INTERFACE:${CMAKE_INSTALL_INCLUDEDIR}/dfb-testing>)
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/tests/include/dfb DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/dfb-testing
   COMPONENT testing EXCLUDE_FROM_ALL FILES_MATCHING PATTERN "*.hpp")
@@ -34,8 +34,9 @@ install(FILES ${PROJECT_BINARY_DIR}/dfbConfig.cmake ${PROJECT_BINARY_DIR}/dfbCon
   DESTINATION ${_dfb_config_dir})
 install(FILES ${PROJECT_SOURCE_DIR}/LICENSE DESTINATION ${CMAKE_INSTALL_DOCDIR})
 
-# For pkg-config: dfb-core.pc is the headers alone, dfb.pc all components. A dependency is the module of pkg-config that has
-# the headers which CMake has found: this keeps paths of this machine out. If there is none, dfb.pc has its flags.
+# For pkg-config: dfb-core.pc is for the headers alone, dfb.pc for all components. A dependency is named by the module
+# of pkg-config that has the headers which CMake has found, which keeps paths of this machine out. If there is no such
+# module, dfb.pc has the flags of the dependency itself.
 find_package(PkgConfig QUIET)
 set(_dfb_pc_requires dfb-core)
 set(_dfb_pc_cflags "")
@@ -78,7 +79,7 @@ function(_dfb_pc_add component target libraries)
 endfunction()
 
 if(TARGET dfb_mpi)
-  # Without the bindings for C++ that mpi.h may have: pkg-config's mpi does not link them.
+  # Leaves out the C++ bindings that mpi.h may have, as pkg-config's mpi does not link them.
   string(APPEND _dfb_pc_cflags " -DMPICH_SKIP_MPICXX=1 -DOMPI_SKIP_MPICXX=1")
   _dfb_pc_add(mpi MPI::MPI_CXX "${MPI_CXX_LIBRARIES}" mpi ompi-cxx mpich) # mpi: of Debian, whichever is chosen
 endif()
@@ -89,7 +90,7 @@ if(TARGET dfb_snappy)
   _dfb_pc_add(snappy Snappy::snappy $<TARGET_LINKER_FILE:Snappy::snappy> snappy)
 endif()
 
-# From the file on, since what is installed may be moved.
+# Relative to the .pc file, as an installed package may be moved.
 file(RELATIVE_PATH _dfb_pc_include ${CMAKE_INSTALL_FULL_DATADIR}/pkgconfig ${CMAKE_INSTALL_FULL_INCLUDEDIR})
 foreach(_dfb_name dfb dfb-core)
   configure_file(${CMAKE_CURRENT_LIST_DIR}/${_dfb_name}.pc.in ${PROJECT_BINARY_DIR}/${_dfb_name}.pc.in @ONLY)

@@ -1,10 +1,11 @@
 #!/bin/sh
 # sh cmake/install_packages.sh [clang|bench|tests|browser|aarch64]
-# Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
-# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the Python package (100 MB),
-# the examples of other people's programs and those in Fortran, and pictures as EXR and plots need, with "browser" what
-# drives the page of the live view, with "aarch64" a compiler for that processor and qemu: on Debian and Ubuntu with apt-get;
-# elsewhere says what is missing and exits with 1, but for the live view, which is left out then. Quick when nothing is missing.
+# Installs the packages that this machine lacks for building dfb, its tests and its examples. "clang" adds Clang and its
+# sanitizers; "bench" adds what only the benchmarks need; "tests" adds what the site, the Python package (100 MB), the
+# examples with other renderers and in Fortran, and EXR pictures and plots need; "browser" adds what drives the page of
+# the live view; "aarch64" adds a compiler for that processor and qemu. Uses apt-get on Debian and Ubuntu; elsewhere
+# says what is missing and exits with 1, except for the live view, which is then left out. Quick when nothing is
+# missing.
 set -eu
 with=${1:-}
 
@@ -16,13 +17,13 @@ say() {
     echo "install_packages.sh: $*" >&2
 }
 
-# Name of Debian's package for whatever is missing of what can be had in other ways, too.
+# Prints the Debian packages of missing dependencies that may also be there without a package.
 tools() {
     have c++ || have g++ || have clang++ || echo g++
     have cmake || echo cmake
     have ninja || echo ninja-build
     have pkg-config || echo pkg-config
-    # Any MPI will do; two of them side by side get in each other's way.
+    # Any MPI will do. Two of them side by side conflict.
     if ! have mpiexec || ! have mpicxx; then
         echo mpich libmpich-dev
     fi
@@ -53,7 +54,7 @@ if [ "$with" = tests ]; then
     libraries="$libraries libtachyon-mt-0-dev libopenexr-dev python3-matplotlib python3-dev python3-numpy pybind11-dev"
 fi
 
-# Without dpkg: the header that each library is known by.
+# Without dpkg, a library is found by its header.
 missing_headers() {
     while read -r name headers; do
         for header in $headers; do
@@ -112,7 +113,7 @@ apt() {
 if ! apt install --no-install-recommends $missing; then
     say "refreshing the package lists and trying once more"
     apt update || say "they cannot be refreshed now"
-    # A release may lack some. CMake says what it leaves out then.
+    # A release may lack some packages. CMake then says what it leaves out.
     known=
     for package in $missing; do
         if LC_ALL=C apt-cache policy "$package" | grep '^  Candidate: [^(]' >/dev/null; then

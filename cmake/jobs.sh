@@ -1,7 +1,7 @@
 #!/bin/sh
 # sh cmake/jobs.sh
-# Prints how many compilers to run at once: one for each processor that this process may use, if there is memory for
-# them, as a file of ours takes up to 1.5 GB.
+# Prints how many compilers to run at the same time: one for each processor that this process may use, but only as many
+# as there is memory for. A file of ours takes up to 1.5 GB.
 set -eu
 
 jobs=$(env -u OMP_NUM_THREADS nproc 2>/dev/null || getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)

@@ -1,5 +1,5 @@
-# C and Fortran, for programs that use examples/adapters/c, where there are compilers: targets in several folders are
-# compiled with them, so they are enabled here, above all of these.
+# Enables C and Fortran, if there are compilers, for programs that use examples/adapters/c. They are enabled here, above
+# all folders, as targets in several of them need these languages.
 if(NOT TARGET dfb::mpi)
   return()
 endif()
@@ -11,7 +11,7 @@ foreach(_language C Fortran)
   endif()
 endforeach()
 
-# MPI's compilers for them, beside that for C++: `mpicc.openmpi` for `mpicxx.openmpi`.
+# MPI's compilers for C and Fortran that belong to the one for C++, such as `mpicc.openmpi` for `mpicxx.openmpi`.
 foreach(_name mpicc mpifort)
   string(REGEX REPLACE "mpi(cxx|c\\+\\+|CC)([^/]*)$" "${_name}\\2" DFB_${_name} "${MPI_CXX_COMPILER}")
   if(DFB_${_name} STREQUAL MPI_CXX_COMPILER OR NOT EXISTS ${DFB_${_name}})

@@ -1,10 +1,10 @@
 # dfb::core        the library, on threads alone
-# dfb::mpi, dfb::tbb, dfb::snappy   core and one dependency more, which the definition DFB_HAS_... tells the headers
-# dfb::dfb         core and all of these that are switched on
-# dfb::compiled    dfb::dfb, but what the library does is compiled once, for all that link it
-# dfb::testing     core and, with an include folder of its own, what tests are made of: an exact reference, checks of tile
+# dfb::mpi, dfb::tbb, dfb::snappy   core and one dependency each; a definition DFB_HAS_... tells the headers of it
+# dfb::dfb         core and all of these that are enabled
+# dfb::compiled    dfb::dfb, with function bodies compiled once for all programs that link it
+# dfb::testing     core and, in an include folder of its own, helpers for tests: an exact reference, checks of tile
 #                  operations and transports. Not part of dfb::dfb
-# dfb::strict_fp   for bitwise equal images over compilers: no contraction of a * b + c to one rounding
+# dfb::strict_fp   for images that are bitwise equal with all compilers: a * b + c is not contracted to one rounding
 
 function(_dfb_add_component name)
   add_library(dfb_${name} INTERFACE)
@@ -12,7 +12,7 @@ function(_dfb_add_component name)
   set_target_properties(dfb_${name} PROPERTIES EXPORT_NAME ${name})
 endfunction()
 
-# find_package, and what to do when there is nothing to find.
+# Calls find_package, and ends with an error if nothing is found.
 macro(_dfb_require option packages target)
   find_package(${ARGN} QUIET)
   if(NOT TARGET ${target})
@@ -61,14 +61,14 @@ if(DFB_WITH_SNAPPY)
   list(APPEND DFB_COMPONENTS snappy)
 endif()
 
-# Not exported: the installed package puts dfb::dfb together from the components that were asked for.
+# Not exported, as the installed package builds dfb::dfb from the requested components.
 add_library(dfb INTERFACE)
 add_library(dfb::dfb ALIAS dfb)
 foreach(_dfb_component IN LISTS DFB_COMPONENTS)
   target_link_libraries(dfb INTERFACE dfb_${_dfb_component})
 endforeach()
 
-# Made where it is used: by the project that links it, with that project's compiler and flags.
+# Built where it is used: by the project that links it, with the compiler and flags of that project.
 add_library(dfb_compiled STATIC EXCLUDE_FROM_ALL ${PROJECT_SOURCE_DIR}/include/dfb/compiled.cpp)
 add_library(dfb::compiled ALIAS dfb_compiled)
 target_compile_definitions(dfb_compiled PUBLIC DFB_COMPILED)

@@ -1,8 +1,8 @@
 #!/bin/sh
 # sh examples/demo.sh [--live] [SCENE FILE...]
-# Installs what is missing, builds dfb_render (preset "release", in build/release) and renders the files, or a made-up
-# scene, on 4 MPI ranks, each of which has a part of the data. Writes demo.png into the current folder; with --live shows
-# it in a browser, where it can be turned, until the job is ended there or by Ctrl-C.
+# Installs what is missing, builds dfb_render (preset "release", in build/release), and renders the files, or a
+# generated scene, on 4 MPI ranks, each of which has a part of the data. Writes demo.png into the current folder. With
+# --live, shows the scene in a browser, where it can be turned, until the job is ended there or by Ctrl-C.
 set -eu
 
 ranks=4
@@ -55,7 +55,7 @@ say "building dfb_render in $build"
     cmake --build --preset release --parallel "$jobs" --target dfb_render
 )
 
-# The launcher of the MPI that was built with.
+# The launcher of the MPI with which dfb_render was built.
 mpiexec=$(sed -n 's/^MPIEXEC_EXECUTABLE:[A-Z]*=//p' "$build/CMakeCache.txt")
 flags=
 if "$mpiexec" --version 2>&1 | grep -E 'Open MPI|OpenRTE|PRRTE' >/dev/null; then

@@ -1,12 +1,12 @@
 #!/bin/sh
 # sh tests/aarch64.sh [CTEST ARGUMENT...]
 # Builds the core of the library and tests for aarch64 (preset "aarch64": no MPI, ranks are threads), and runs them with
-# qemu: the tests of the headers and of numbers, and whole frames, one file after the other. Left out are files that take a
-# minute each there, and those whose ranks must answer within a time, for which qemu is too slow if the machine is busy.
-# Composites the tiles of tests/stress/isa.cpp there and on this machine: all values must be equal bit for bit, and within 1 ulp
-# without -ffp-contract=off, which is dfb::strict_fp. Arguments go to ctest, in the place of that choice of tests, such as
-# -R '^inproc[.]' for all frames. Installs what is missing; takes 11 minutes on one core.
-# Exits with 77 on other machines than x86-64, and where there is no cross compiler and none can be installed.
+# qemu: the tests of headers and of numbers, and whole frames, one file after the other. It leaves out files that take a
+# minute each there, and those whose ranks must answer within a time limit, for which qemu may be too slow on a busy
+# machine. Composites the tiles of tests/stress/isa.cpp there and on this machine. All values must be equal bit for bit,
+# and within 1 ulp without -ffp-contract=off, which is the flag of dfb::strict_fp. Arguments go to ctest and replace
+# this choice of tests, such as -R '^inproc[.]' for all frames. Installs what is missing; takes 11 minutes on one core.
+# Exits with 77 on machines other than x86-64, and if there is no cross compiler and none can be installed.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)

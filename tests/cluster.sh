@@ -25,12 +25,12 @@ cp -a "$root" "$root.run"
 root=$root.run
 enter_root
 
-# section NAME: of dfb.def
+# section NAME: prints that section of dfb.def
 section() {
     awk -v name="%$1" '/^%/ { on = $1 == name; next } on' "$source/examples/cluster/dfb.def"
 }
 
-# step NAME: runs that section there, as Apptainer does: by sh, up to the first error.
+# step NAME: runs that section in the system as Apptainer does: with sh, up to the first error.
 step() {
     say "%$1 of dfb.def"
     section "$1" >"$root/tmp/step"

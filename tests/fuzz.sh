@@ -1,8 +1,9 @@
 #!/bin/sh
 # sh tests/fuzz.sh [SECONDS [TARGET...]]
-# Installs what is missing, builds the fuzz targets for libFuzzer with the preset "fuzz", and runs each, or those that
-# are named, for so long (60 seconds if none are given), as many at once as there are cores. What is found anew stays in
-# build/fuzz/corpus, and an input that a run ends with in build/fuzz/crashes: it belongs into tests/fuzz/corpus.
+# Installs what is missing and builds the fuzz targets for libFuzzer with the preset "fuzz". Runs each target, or those
+# that are named, for SECONDS (default 60), as many at a time as there are cores. New inputs are kept in
+# build/fuzz/corpus. An input that crashes a target is kept in build/fuzz/crashes and should be added to
+# tests/fuzz/corpus.
 set -u
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
@@ -31,7 +32,7 @@ done
 # shellcheck disable=SC2086 # one word per program
 cmake --build --preset fuzz --parallel "$jobs" --target $programs || exit 1
 
-# A single input gets 10 seconds, 2 GB, and 256 MB at a time.
+# A single input may take 10 seconds and 2 GB, at most 256 MB in one allocation.
 export ASAN_OPTIONS="detect_stack_use_after_return=1" UBSAN_OPTIONS="print_stacktrace=1"
 printf '%s\n' "$@" | xargs -P "$jobs" -I{} sh -c '
     build/fuzz/tests/test_fuzz_{} -max_total_time='"$seconds"' -timeout=10 -rss_limit_mb=2048 -malloc_limit_mb=256 -max_len=8192 \

@@ -1,10 +1,11 @@
 #!/bin/sh
 # sh tests/sanitizers.sh [--brief] [PRESET...]
-# Installs what is missing, then builds the presets "asan", "tsan" and "clang", or those that are named, and runs the
-# tests of what the library does in each. With --brief, for CI,
-#   "asan" leaves out what runs in one process with ranks as threads, which "tsan" has; 2 and 7 ranks over MPI, as it has
-#     3; and uses of a function's variables after its end, for which it takes most of the time;
-#   "tsan" leaves out what has one thread, which "asan" has: fuzz targets, and the longer ones of the unit tests;
+# Installs what is missing, builds the presets "asan", "tsan" and "clang", or those that are named, and runs the
+# library's tests in each. With --brief, for CI,
+#   "asan" leaves out tests with ranks as threads, which "tsan" runs; 2 and 7 ranks over MPI, as it runs 3; and the
+# check for
+#     uses of a function's variables after its end, which takes most of the time;
+#   "tsan" leaves out tests with a single thread, which "asan" runs: fuzz targets and the longer unit tests;
 #   both leave out instruction sets, numbers and steps of credit, which take them minutes.
 set -u
 
@@ -20,7 +21,7 @@ fi
 jobs=$(sh cmake/jobs.sh)
 [ $# -gt 0 ] || set -- asan tsan clang
 
-# All test programs but that of guard.odr, which runs nothing and takes long to compile. A test whose program is missing
+# All test programs except that of guard.odr, which runs nothing and takes long to compile. A test without its program
 # fails.
 run() {
     cmake --preset "$1" || return

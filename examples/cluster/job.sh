@@ -1,7 +1,7 @@
 #!/bin/sh
 # sbatch -N NODES job.sh PROGRAM [ARGUMENT...]
-# One rank on each node, with all of its processors. Options of sbatch win over these lines; MPI=pmix in the environment is
-# for Open MPI, the default for MPICH.
+# Runs one rank on each node, with all of its processors. Options of sbatch override the lines below. The default is for
+# MPICH; set MPI=pmix in the environment for Open MPI.
 #SBATCH --job-name=dfb
 #SBATCH --ntasks-per-node=1
 #SBATCH --exclusive

@@ -1,7 +1,7 @@
 # Run with: cmake -DIN=<file> -DOUT=<.cpp> -P embed.cmake
-# Makes a C++ source that has the file as a string.
+# Writes a C++ source that has the file as a string.
 file(READ ${IN} text)
-# Compilers need not take a literal of more than 65536 characters; adjacent ones are one.
+# Compilers may limit a literal to 65536 characters. Adjacent literals are joined.
 string(LENGTH "${text}" length)
 set(literals "")
 set(at 0)

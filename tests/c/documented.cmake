@@ -1,5 +1,5 @@
 # cmake -DROOT=<source dir> -P documented.cmake
-# Blocks of C and Fortran in docs/recipes.md are lines of the programs of examples/adapters/c, one after the other.
+# Checks that the blocks of C and Fortran in docs/recipes.md are lines, in order, of programs in examples/adapters/c.
 cmake_minimum_required(VERSION 3.16)
 file(READ ${ROOT}/docs/recipes.md page)
 foreach(language IN ITEMS c:minimal.c fortran:heat.f90)

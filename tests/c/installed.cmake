@@ -1,5 +1,5 @@
 # cmake -DBUILD= -DSTAGE= -DADAPTER= -DLIBDIR= -DMPICC= -DMPIFORT= -P installed.cmake
-# Installs component c into STAGE, and builds programs there by the lines of the adapter's README.md. MPIFORT may be empty.
+# Installs component c into STAGE, and builds programs there as the adapter's README.md says. MPIFORT may be empty.
 cmake_minimum_required(VERSION 3.21)
 file(REMOVE_RECURSE ${STAGE})
 execute_process(COMMAND ${CMAKE_COMMAND} --install ${BUILD} --component c --prefix ${STAGE} COMMAND_ERROR_IS_FATAL ANY)

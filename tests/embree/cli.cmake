@@ -22,7 +22,7 @@ target_link_libraries(dfb_check_trace PRIVATE dfb_developer nlohmann_json::nlohm
 add_executable(dfb_make_volume embree/tools/make_volume.cpp)
 target_link_libraries(dfb_make_volume PRIVATE dfb_developer)
 
-# The same program, but that rank 1 stops in the middle of its frames.
+# The same program, except that rank 1 stops in the middle of its frames.
 if(TARGET dfb::mpi AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
   add_executable(dfb_render_stopped $<TARGET_OBJECTS:dfb_render> embree/tools/stop_rank.cpp)
   target_link_libraries(dfb_render_stopped PRIVATE dfb_developer dfb_embree_example dfb_live)
@@ -41,7 +41,7 @@ if(TARGET dfb::snappy)
   set(_snappy ON)
 endif()
 get_target_property(_exr dfb_embree_example INTERFACE_DFB_HAS_OPENEXR)
-# One that has matplotlib, be it not the first in the path.
+# A Python with matplotlib, even if it is not the first in PATH.
 set(_python "")
 foreach(_candidate IN ITEMS python3 /usr/bin/python3)
   execute_process(COMMAND ${_candidate} -c "import matplotlib" RESULT_VARIABLE _code OUTPUT_QUIET ERROR_QUIET)

@@ -1,5 +1,5 @@
 # cmake -DSETTINGS=<file> -DCASE=<case> -DSTART=<one|ranksN|npN> -P cli_cases.cmake
-# One case of render.cli: runs dfb_render and looks at what comes out. Nothing may take longer than `limit`.
+# Runs one case of render.cli: starts dfb_render and checks what it writes. No run may take longer than `limit`.
 cmake_policy(VERSION 3.16)
 include(${SETTINGS})
 set(limit 60)
@@ -9,8 +9,8 @@ file(MAKE_DIRECTORY ${work})
 
 # ---- running ---------------------------------------------------------------------------------------------------
 
-# Runs `dfb_render <argument>...` in the work folder, started as `start` says; leaves code, out, err and command.
-# `prefix` may hold words to put before all that.
+# Runs `dfb_render <argument>...` in the work folder, started as `start` says. Sets code, out, err and command. `prefix`
+# may hold words that come before the whole command.
 set(prefix "")
 function(run start)
   set(command ${RENDER})
@@ -37,7 +37,7 @@ macro(wrong why)
   message(SEND_ERROR "${why}\n  command: ${command}\n  exit: ${code}\n  output: ${out}\n  errors: ${err}")
 endmacro()
 
-# A run that must succeed, without a word on standard error (but for paths in a scene with a volume).
+# A run that must succeed without output on standard error (except for paths, in a scene with a volume).
 macro(succeed start)
   run(${start} ${ARGN})
   if(NOT code STREQUAL "0")
@@ -47,7 +47,7 @@ macro(succeed start)
   endif()
 endmacro()
 
-# A run that must succeed, and say one line on standard error that matches `pattern`.
+# A run that must succeed and print one line on standard error that matches `pattern`.
 macro(succeed_with start pattern)
   run(${start} ${ARGN})
   if(NOT code STREQUAL "0")
@@ -62,7 +62,7 @@ macro(fail start pattern)
   end_with(1 ${start} "${pattern}" ${ARGN})
 endmacro()
 
-# A run that must end with the exit code 2 and one such line, since the command line is wrong.
+# A run that must end with the exit code 2 and one such line, as the command line is wrong.
 macro(refuse start pattern)
   end_with(2 ${start} "${pattern}" ${ARGN})
 endmacro()
@@ -85,7 +85,7 @@ macro(end_with expected start pattern)
   endif()
 endmacro()
 
-# The value of a field of a JSON file of ours, in `result`; of the last frame where there are several.
+# Sets `result` to a field of a JSON file of dfb_render; if there are several frames, to that of the last.
 function(field result file name)
   file(READ ${work}/${file} text)
   string(REGEX MATCHALL "\"${name}\": [^,\n]+" found "${text}")
@@ -98,7 +98,8 @@ function(field result file name)
   set(${result} "${value}" PARENT_SCOPE)
 endfunction()
 
-# The statistics of a run of so many ranks add up, and none has read more than `bytes` of files.
+# Checks that the statistics of a run have so many ranks and add up, and that no rank has read more than `bytes` of
+# files.
 function(check_stats file ranks bytes)
   execute_process(COMMAND ${CHECK_STATS} ${file} ${ranks} ${bytes} WORKING_DIRECTORY ${work}
     RESULT_VARIABLE code OUTPUT_VARIABLE out ERROR_VARIABLE err OUTPUT_STRIP_TRAILING_WHITESPACE)
@@ -109,7 +110,7 @@ function(check_stats file ranks bytes)
   endif()
 endfunction()
 
-# 2 or 6: RGB or RGBA, as the header of the PNG says.
+# The colour type in the header of the PNG: 2 is RGB, 6 is RGBA.
 function(expect_png_type expected file)
   file(READ ${work}/${file} type OFFSET 25 LIMIT 1 HEX)
   if(NOT type STREQUAL "0${expected}")
@@ -117,7 +118,7 @@ function(expect_png_type expected file)
   endif()
 endfunction()
 
-# Their bytes are equal.
+# The bytes of both files must be equal.
 function(expect_equal_files a b)
   file(SHA256 ${work}/${a} hash_a)
   file(SHA256 ${work}/${b} hash_b)
@@ -136,7 +137,7 @@ macro(hash result start)
   endif()
 endmacro()
 
-# The same with one rank. It is computed once for all tests: the folder is of this build of the program.
+# The same with one rank. It is computed once for all tests, in a folder of this build of the program.
 macro(hash_alone result)
   file(TIMESTAMP ${RENDER} _built "%Y%m%d%H%M%S")
   string(SHA256 _name "${ARGN}")
@@ -167,7 +168,7 @@ function(compare a b tolerance fraction)
   endif()
 endfunction()
 
-# ---- scenes of which there is no file in the tree --------------------------------------------------------------
+# ---- scenes that are not files in the source tree --------------------------------------------------------------
 
 function(write_volume name voxel) # 4x4x4
   string(REPEAT "${voxel}" 64 bytes)
@@ -221,7 +222,7 @@ if(CASE STREQUAL "help")
 elseif(CASE STREQUAL "bad_options")
   refuse(${START} "scene|SCENE")
   refuse(${START} "--size" demo --size 0x64)
-  # One function reads the options, before ranks start.
+  # Tested with START one only, as the same function reads the options before ranks start.
   if(NOT START STREQUAL "one")
     return()
   endif()
@@ -273,12 +274,12 @@ elseif(CASE STREQUAL "bad_files")
   foreach(name empty.ply missing.ply short.ply bad.obj missing.obj short.xyz missing.xyz)
     fail(${START} "${name}: " good.obj ${name} good_4x4x4_uint8.raw --size 16x16)
   endforeach()
-  # Also where this rank would have nothing to render, and in the other mode.
+  # An error also if this rank would have nothing to render, and in the other mode.
   fail(${START} "short.xyz: " short.xyz --bricks 1 --size 16x16)
   fail(${START} "short.xyz: " short.xyz --mode image --size 16x16)
 
 elseif(CASE STREQUAL "headers")
-  # A header says what the name of a .raw file and the options say.
+  # A header gives what otherwise the name of a .raw file and the options give.
   string(REPEAT "voxels of a head" 256 voxels)
   file(WRITE ${work}/head_16x16x16_uint8.raw "${voxels}")
   set(nrrd "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 16 16 16\nencoding: raw\n")
@@ -327,7 +328,7 @@ elseif(CASE STREQUAL "bad_output")
     list(GET option 1 path)
     fail(${START} "${path}: cannot be written" demo --size 16x16 ${option})
   endforeach()
-  # Said before anything is rendered, so nothing is written either.
+  # The error comes before anything is rendered, so nothing is written either.
   fail(${START} "none/x.json: " demo --size 16x16 --output image.png --stats none/x.json)
   if(EXISTS ${work}/image.png)
     wrong("expected no image.png")
@@ -357,7 +358,7 @@ elseif(CASE STREQUAL "too_large")
   endif()
 
 elseif(CASE STREQUAL "algorithms")
-  # Whatever is asked for, the image does not show how many ranks there were.
+  # The image does not depend on the number of ranks, whatever the options are.
   set(small --size 72x56 --bricks 3)
   foreach(options "--ao 2" "--shadows" "--camera dof --spp 3" "--camera motion --spp 3" "--camera stereo" "--camera dome"
       "--mode image --path 2 --spp 2" "--interleave 3 --deep 8" "--interleave 3" "--interleave 3 --deep 1"
@@ -377,7 +378,7 @@ elseif(CASE STREQUAL "algorithms")
       endif()
     endif()
   endforeach()
-  # Blended in the order of the bricks, or the nearest alone where all is opaque: the same.
+  # Blending in the order of the bricks, or keeping only the nearest of opaque surfaces, gives the same image.
   file(WRITE ${work}/tetrahedron.obj "${tetrahedron}")
   foreach(pair "order,demo" "order,demo --camera dome" "nearest,tetrahedron.obj --opacity 1")
     string(REPLACE "," ";" pair "${pair}")
@@ -390,13 +391,13 @@ elseif(CASE STREQUAL "algorithms")
     succeed(${START} ${scene} ${small} --output blended.pfm --blend ${blend} --mode mixed)
     compare(sorted.pfm blended.pfm 2e-5 0)
   endforeach()
-  # However the work is shared, neither.
+  # Nor does it depend on how the work is shared.
   hash_alone(data demo ${small})
   foreach(options "" "--mode mixed" "--mode mixed --replicate 3 --frames 1" "--mode mixed --balance round-robin --replicate 99")
     separate_arguments(options)
     expect_hash(${data} ${START} demo ${small} ${options})
   endforeach()
-  # Several frames under way at once: the last is what it would be by itself.
+  # With several frames in flight, the last one is the same as if it were rendered alone.
   foreach(options "" "--mode mixed" "--mode image --spp 2 --distribution dynamic" "--interleave 3 --deep 8")
     separate_arguments(options)
     hash_alone(turn demo ${small} ${options} --frames 5)
@@ -431,7 +432,7 @@ elseif(CASE STREQUAL "precision")
       ${DATA}/boston_teapot_256x256x178_uint8.raw)
   endif()
   foreach(scene IN LISTS scenes)
-    # Exact in 8 bits, and in float but for ties of the last bit.
+    # Exact in 8 bits, and in float except for ties of the last bit.
     foreach(output "image.png --background 0,0,0" image.png image.pfm)
       separate_arguments(output)
       succeed(${START} ${scene} ${small} --spp 3 --verify --output ${output})
@@ -445,7 +446,7 @@ elseif(CASE STREQUAL "precision")
         wrong("expected the auxiliary channels to be right")
       endif()
     endforeach()
-    # Each budget is promised and kept; from 2 bricks in a tile on rounding shows.
+    # Each error budget is promised and kept. From 2 bricks in a tile on, rounding has an effect.
     succeed(${START} ${scene} ${small} --output exact.pfm --depth exact_depth.pfm)
     foreach(budget 1e-2 2e-3 5e-4 1e-5)
       succeed(${START} ${scene} ${small} --error-budget ${budget} --output rounded.pfm --depth depth.pfm
@@ -510,7 +511,7 @@ elseif(CASE STREQUAL "ordinary")
   hash_alone(thin demo --size 3x500 --bricks 3)
   expect_hash(${thin} ${START} demo --size 3x500 --bricks 3)
 
-  # The first brick, which is rank 0's, holds nothing.
+  # The first brick, which belongs to rank 0, is empty.
   file(WRITE ${work}/corners.xyz "2\n\nC 0 9 0\nC 10 0 0\n")
   file(WRITE ${work}/corners_twice.xyz "2\n\nC 0 9 0\nC 10 0 0\n2\n\nC 0 9 0\nC 10 0 0\n")
   hash_alone(corners corners.xyz --size 96x64 --bricks 4)
@@ -520,7 +521,7 @@ elseif(CASE STREQUAL "ordinary")
     wrong("expected two spheres to be seen, mean_alpha is ${alpha}")
   endif()
 
-  # A view of nothing: no voxel above the least that is shown; surfaces without opacity.
+  # A view of nothing: no voxel is above the least visible value, and surfaces have no opacity.
   write_volume(nothing_4x4x4_uint8.raw "\t")
   foreach(scene "nothing_4x4x4_uint8.raw" "corners.xyz --opacity 0")
     separate_arguments(scene)
@@ -537,7 +538,7 @@ elseif(CASE STREQUAL "ordinary")
     endforeach()
   endforeach()
 
-  # What is not as a file or an option may have meant it: one line, from one rank.
+  # Files and options that may have been meant otherwise: one line, from one rank.
   file(WRITE ${work}/atoms.xyz "2\n\nXx 0 9 0\nFE 10 +0.5 0 7\n1\n\nC 0 0 0\n")
   succeed_with(${START} "Xx .1." atoms.xyz --xyz-frame 1 --size 96x64 --output note.png)
   succeed_with(${START} "several frames" corners_twice.xyz --size 96x64 --output note.png)
@@ -580,7 +581,7 @@ elseif(CASE STREQUAL "stats")
         OR render_ms GREATER total_ms OR compositing_ms LESS 0 OR compositing_ms GREATER total_ms)
       wrong("implausible times ${total_ms}, ${render_ms}, ${compositing_ms}")
     endif()
-    # What travels is at least some pixels, at most each tile from each rank and once more to the display rank.
+    # The bytes sent are at least some pixels, and at most each tile from each rank and once more to the display rank.
     if(bytes_sent LESS 1000 OR bytes_sent GREATER 3000000 OR messages_sent LESS 2 OR messages_sent GREATER 1000)
       wrong("implausible traffic: ${bytes_sent} bytes in ${messages_sent} messages")
     endif()
@@ -591,7 +592,7 @@ elseif(CASE STREQUAL "stats")
       wrong("implausible memory: ${peak_memory_bytes}")
     endif()
   endforeach()
-  # Whatever is rendered, times add up on each rank.
+  # In all modes, times add up on each rank.
   foreach(options "" "--output image.png" "--output frame_%d.png --alpha frame_%d.pfm" "--mode image --distribution dynamic"
       "--mode mixed --in-flight 2 --output frame_%d.png" "--adaptive 0.02 --spp 16 --output frame_%d.pfm"
       "--wall 2x1 --output wall_%d.png" "--blend order --output image.png" "--interleave 2 --deep 4")

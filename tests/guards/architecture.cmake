@@ -1,5 +1,5 @@
 # Run with: cmake -DROOT=<source dir> -P architecture.cmake
-# docs/architecture.md names files that exist, and functions that are in the files beside them.
+# Checks that the files which docs/architecture.md names exist, and that the functions beside them are in these files.
 file(STRINGS ${ROOT}/docs/architecture.md lines)
 set(files 0)
 set(functions 0)
@@ -27,7 +27,7 @@ if(files LESS 20 OR functions LESS 14)
   message(SEND_ERROR "only ${files} files and ${functions} functions found in docs/architecture.md: has its form changed?")
 endif()
 
-# Its rooms are the folders.
+# The rooms of the drawing are the folders.
 file(GLOB rooms RELATIVE ${ROOT} ${ROOT}/include/dfb/*)
 file(READ ${ROOT}/docs/architecture.md text)
 foreach(room IN LISTS rooms)

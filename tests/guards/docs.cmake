@@ -1,6 +1,6 @@
 # Run with: cmake -DROOT=<source dir> -P docs.cmake
-# docs/configuration.md has each field of each configuration, and no other; links within README and docs lead somewhere;
-# the README is short; what repeats the version has that of dfb/version.hpp.
+# Checks that docs/configuration.md has exactly the fields of each configuration, that links in README and docs are
+# valid, that the README is short, and that every copy of the version equals that in dfb/version.hpp.
 cmake_minimum_required(VERSION 3.16)
 file(READ ${ROOT}/docs/configuration.md page)
 set(count 0)

@@ -4,7 +4,7 @@ if(MSVC)
   return()
 endif()
 
-# Without source lines in the messages, so that only the message itself can be taken for the message.
+# Without source lines in the compiler's messages, so that only the message itself can match.
 if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
   set(_terse -fno-diagnostics-show-caret)
 else()
@@ -26,13 +26,13 @@ add_test(NAME guard.docs
   COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/guards/docs.cmake)
 set_tests_properties(guard.readme guard.architecture guard.docs PROPERTIES LABELS guard)
 
-# The site comes without a warning; Doxygen warns of links that lead nowhere.
+# The site is built without a warning. Doxygen warns of broken links.
 if(TARGET docs)
   add_test(NAME guard.site COMMAND Doxygen::doxygen ${PROJECT_BINARY_DIR}/site/Doxyfile)
   set_tests_properties(guard.site PROPERTIES LABELS guard)
 endif()
 
-# The blocks of code in docs/ compile, and the operations there are right.
+# The blocks of code in docs/ compile, and the operations in them work.
 if(TARGET dfb::mpi AND TARGET dfb::snappy)
   include(guards/doc_blocks/blocks.cmake)
   dfb_write_doc_blocks(_doc_blocks ${PROJECT_SOURCE_DIR} ${CMAKE_CURRENT_BINARY_DIR})
@@ -49,9 +49,9 @@ if(TARGET dfb::mpi AND TARGET dfb::snappy)
   set_tests_properties(guard.documented_operations PROPERTIES LABELS guard)
 endif()
 
-# Every header compiles alone, with a second inclusion after it. A header that is the door of a dependency does so
-# with that component, the umbrella with each set of components, all others with nothing but our include folder.
-# Bodies that dfb::compiled compiles once are read where the header itself has some; elsewhere they take half the time.
+# Every header compiles alone and when it is included twice. A header that is the door of a dependency is compiled with
+# that component, the umbrella header with each set of components, and all others with only our include folder. Function
+# bodies that dfb::compiled compiles once are read if the header itself has some. Elsewhere they would double the time.
 function(_dfb_flags_of out target)
   set(folders "$<TARGET_PROPERTY:${target},INTERFACE_INCLUDE_DIRECTORIES>")
   set(${out} "$<$<BOOL:${folders}>:-idirafter$<JOIN:${folders},$<SEMICOLON>-idirafter>>" PARENT_SCOPE)
@@ -105,7 +105,7 @@ foreach(_component mpi tbb snappy)
   endif()
 endforeach()
 
-# Without components nothing of MPI, oneTBB and Snappy is touched, even where they are installed.
+# Without components no header of MPI, oneTBB or Snappy is included, even if they are installed.
 list(TRANSFORM _headers REPLACE "(.+)" "#include <\\1>\n" OUTPUT_VARIABLE _include_all)
 list(JOIN _include_all "" _include_all)
 file(CONFIGURE OUTPUT all_of_core.cpp CONTENT "${_include_all}" @ONLY)
@@ -114,7 +114,7 @@ add_test(NAME guard.core_dependencies # -M lists what is included, and compiles 
 set_tests_properties(guard.core_dependencies PROPERTIES LABELS guard
   FAIL_REGULAR_EXPRESSION "/mpi\\.h;/mpicxx\\.h;/snappy[a-z-]*\\.h;/(tbb|oneapi)/[a-z_/]*\\.h")
 
-# The benchmarks, which are not built with the tests but for those in scaling/, still compile.
+# The benchmarks still compile. Except for those in scaling/, they are not built with the tests.
 if(TARGET dfb::mpi AND TARGET dfb::tbb AND TARGET dfb::snappy)
   file(GLOB _programs CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/bench/*/bench_*.cpp)
   list(FILTER _programs EXCLUDE REGEX "/scaling/")
@@ -134,15 +134,15 @@ if(TARGET dfb::mpi AND TARGET dfb::tbb AND TARGET dfb::snappy)
   endforeach()
 endif()
 
-# Two translation units that include everything make one program; what the first uses stays quiet under stricter
-# warnings.
+# Two translation units that include everything link to one program. The code that the first one uses compiles without
+# warnings under stricter flags.
 add_executable(test_odr guards/odr/first.cpp guards/odr/second.cpp)
 target_link_libraries(test_odr PRIVATE dfb_developer_headers)
 target_compile_options(test_odr PRIVATE -Wconversion)
 add_test(NAME guard.odr COMMAND test_odr)
 set_tests_properties(guard.odr PROPERTIES LABELS guard)
 
-# A program of which some files link dfb::compiled and others have the library as headers is refused by the linker.
+# The linker refuses a program of which some files link dfb::compiled and others use the headers alone.
 if(NOT DFB_DEVELOP_HEADER_ONLY AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
   add_test(NAME guard.compiled_mixed COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -I${_include}
     ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/headers.cpp ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/compiled.cpp
@@ -151,10 +151,10 @@ if(NOT DFB_DEVELOP_HEADER_ONLY AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
     PASS_REGULAR_EXPRESSION "dfb_either_all_files_with_dfb_compiled_or_none: TLS definition")
 endif()
 
-# Wrong use gives our message, as the first error. The cases stand in the files: a line
+# Wrong use gives our message as the first error. The cases are in the files; a new case needs only a line
 #   #elif defined(CASE_<NAME>) // expect: <message>      or   // flags: <flag>... expect: <message>
-# is all that a new one needs here. Without a case the file is the control, which must compile. dfb.hpp is compiled
-# beforehand, once for all files that begin with it; a compiler that cannot use the result reads dfb.hpp itself.
+# Without a case the file is the control, which must compile. dfb.hpp is precompiled once for all files that begin with
+# it. A compiler that cannot use the result reads dfb.hpp itself.
 set(_early ${CMAKE_CURRENT_BINARY_DIR}/compile_fail/dfb_early.hpp)
 file(CONFIGURE OUTPUT ${_early} CONTENT "#include <dfb/dfb.hpp>\n" @ONLY)
 if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")

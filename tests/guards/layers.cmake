@@ -1,5 +1,5 @@
 # cmake "-DROOTS=<folder that holds dfb/>;..." -P layers.cmake
-# Checks what the include lines of the headers promise. A new header goes into the table below.
+# Checks that the includes of the headers keep the layers of the library. A new header must be added to the table below.
 cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
@@ -33,21 +33,22 @@ set(level_15 distributed_framebuffer.hpp image_compositor.hpp)
 set(level_16 dfb.hpp)
 set(last_level 16)
 
-# A dependency has one door.
+# A dependency is included through a single header, its door.
 set(door_of_mpi comm/mpi_calls.hpp)
 set(door_of_snappy comm/snappy_codec.hpp)
 set(door_of_tbb tbb_executor.hpp)
 
-# The calls of MPI that the library makes. They wait for no other rank: in those that do, MPI libraries spin, hold their
-# lock, and wait for ever for a rank that has failed. MPI_Finalize() is for MpiSession alone. "Request" is a type.
+# The MPI calls that the library makes. They do not wait for other ranks: in calls that wait, MPI libraries spin, hold
+# their lock, and wait for ever for a rank that has failed. Only MpiSession may call MPI_Finalize(). "Request" is a
+# type.
 set(calls_of_mpi
     Abort Cancel Comm_create_keyval Comm_delete_attr Comm_free Comm_free_keyval Comm_get_attr Comm_idup
     Comm_rank Comm_set_attr Comm_set_errhandler Comm_size Comm_test_inter Error_class Error_string Finalize
     Get_count Get_processor_name Iallgather Iallreduce Ialltoall Ibarrier Ibcast Init_thread Irecv Isend Issend
     Query_thread Request Test Test_cancelled Testall Testsome)
 
-# Who must not see whom, however many includes are in between. Rooms are folders; of the headers at the root those count
-# as pixels that say what a tile is and what is made of it.
+# Headers that must not include others, even indirectly. Rooms are folders. Of the headers at the root, those that
+# define a tile and what is made of it count as pixels.
 set(pixels "^((image|levels|tile|tile_layout|fragment|dependency_tracker|channels|tile_op|pixel_op)|(blend|ops)/.*)\\.hpp$")
 set(messages "^(comm)/.*\\.hpp$")
 set(loops "^(render)/.*\\.hpp$")
@@ -140,7 +141,7 @@ foreach(header IN LISTS headers)
   endif()
 endforeach()
 
-# reached: what `header` includes, directly or not.
+# reached: all headers that `header` includes, directly or indirectly
 function(collect header)
   foreach(target IN LISTS "includes_of_${header}")
     if(NOT target IN_LIST reached)

@@ -1,5 +1,5 @@
 # Run with: cmake -DROOT=<source dir> -P readme.cmake
-# The program in the README is examples/minimal.cpp, without its comment at the top.
+# Checks that the program in the README is examples/minimal.cpp, without the comment at its top.
 file(READ ${ROOT}/examples/minimal.cpp program)
 file(READ ${ROOT}/README.md readme)
 string(REGEX REPLACE "^(//[^\n]*\n)+" "" program "${program}")

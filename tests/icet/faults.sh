@@ -1,10 +1,10 @@
 #!/bin/sh
 # sh tests/icet/faults.sh [--cases N | --check]
-# Puts faults into libdfb_icet, one at a time, in a copy of the tree, and checks that the differential test fails with
-# each. The faults are at the end of this file. 10 minutes on 2 cores.
-#   --cases N   of the differential test; default 200
-#   --check     only looks whether the adapter still has the lines that the faults are put into
-# Exits with 0 if each fault was found, and with 77 if IceT is not there (sh bench/get_icet.sh).
+# Puts faults into libdfb_icet, one at a time, in a copy of the source tree, and checks that the differential test finds
+# each. The faults are at the end of this file. Takes 10 minutes on 2 cores.
+#   --cases N   cases of the differential test; default 200
+#   --check     only checks that the adapter still has the lines into which the faults are put
+# Exits with 0 if each fault was found, and with 77 if there is no IceT (sh bench/get_icet.sh).
 set -eu
 
 source=$(CDPATH='' cd -- "$(dirname -- "$0")/../.." && pwd)
@@ -19,13 +19,13 @@ build() {
     cmake --build "$copy/build" --target dfb_icet test_icet_differential >"$copy/build.log" 2>&1
 }
 
-# differential: the test's output in $copy/test.log
+# differential: runs the test, with its output in $copy/test.log
 differential() {
     timeout 300 mpiexec -n 3 "$copy/build/tests/icet/test_icet_differential" "$icet" \
         "$copy/build/examples/adapters/icet/libdfb_icet.so" --cases "$cases" </dev/null >"$copy/test.log" 2>&1
 }
 
-# put FILE OLD NEW: writes the adapter's file with the text OLD of one line as NEW. It must be there once.
+# put FILE OLD NEW: replaces the text OLD in the adapter's file by NEW. OLD must occur exactly once.
 put() {
     awk -v old="$2" -v new="$3" '
         { at = index($0, old) }

@@ -28,7 +28,7 @@ probe=/build/paraview_probe.so
 in_root sh -c "mpicxx.openmpi -std=c++17 -O2 -shared -fPIC -I \$(echo /usr/include/paraview*/vtkicet/src/include) \
     /dfb/tests/icet/paraview_probe.cpp -o $probe" || give_up "the probe does not compile"
 
-# draw FOLDER [LIBRARY]: in the place of IceT
+# draw FOLDER [LIBRARY]: draws with LIBRARY in place of IceT
 draw() {
     say "drawing with ${2:-IceT}"
     in_root mkdir -p "/out/$1"
@@ -42,7 +42,7 @@ draw() {
 rm -rf "$root/out"
 draw icet
 draw dfb $adapter
-# Without the library nothing would differ.
+# Checks that the library was used: without it nothing would differ.
 grep -q '^dfb_icet: frame' "$root/out/dfb/scenes.log" || give_up "dfb has not composited: see $root/out/dfb/scenes.log"
 grep -q '^dfb_icet: frame.* in 2 tiles' "$root/out/dfb/wall.log" ||
     give_up "dfb has not composited the wall: see $root/out/dfb/wall.log"

@@ -2,10 +2,9 @@
 # sh tests/live/browser.sh [--only-if-installed] [OUTPUT FOLDER]
 # Tests the page of the live view in Debian's Chromium, driven by puppeteer-core. Installs both, puppeteer-core into
 # ~/.cache/dfb-live (or $DFB_LIVE_NODE_MODULES), builds dfb_render and in_situ (preset "release", unless $DFB_RENDER and
-# $DFB_IN_SITU say where they are), and writes screenshots to the output folder, build/live_browser.
-# Drags for 100 frames; a picture must come within a frame's time and 30 ms.
-# With --only-if-installed: exits with 77 where something is missing, takes fewer and cheaper frames, and allows for a
-# slow machine.
+# $DFB_IN_SITU say where they are), and writes screenshots to the output folder (default: build/live_browser). Drags for
+# 100 frames; each picture must come within the time of a frame and 30 ms. With --only-if-installed: exits with 77 if
+# something is missing, renders fewer and cheaper frames, and allows for a slow machine.
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/../.." && pwd)
 script=tests/live/browser.sh

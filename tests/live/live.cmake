@@ -1,4 +1,4 @@
-# The live view. Where packages that it needs are missing, programs say so.
+# The live view. If packages that it needs are missing, programs say so.
 if(NOT DFB_BUILD_EXAMPLES)
   return()
 endif()

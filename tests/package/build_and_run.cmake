@@ -1,5 +1,5 @@
 # cmake -D SOURCE= -D BUILD= -D GENERATOR= -D ARGUMENTS= [-D FAILS=<regex>] -P build_and_run.cmake
-# Configures, builds and runs the stranger's project from scratch; with FAILS, configuring must fail with that text.
+# Configures, builds and runs the user's project from scratch. With FAILS, configuring must fail with that text.
 cmake_minimum_required(VERSION 3.21)
 
 file(REMOVE_RECURSE ${BUILD})

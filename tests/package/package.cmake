@@ -1,10 +1,10 @@
-# Tests of the package: installs dfb, then builds and runs a stranger's project (CMakeLists.txt beside this file)
-# against it in every way that the README promises.
+# Tests of the package: installs dfb, then builds and runs a user's project (CMakeLists.txt beside this file) against it
+# in every way that the README promises.
 set(_stage ${CMAKE_CURRENT_BINARY_DIR}/stage)
 set(_others ${DFB_COMPONENTS})
 list(REMOVE_ITEM _others core)
 
-# Emptied first: an install over an older one can leave stale files.
+# Emptied first, as an install over an older one can leave stale files.
 add_test(NAME package.clean COMMAND ${CMAKE_COMMAND} -E rm -rf ${_stage} ${_stage}_testing)
 set_tests_properties(package.clean PROPERTIES LABELS package FIXTURES_SETUP dfb_stage_clean)
 add_test(NAME package.install COMMAND ${CMAKE_COMMAND} --install ${PROJECT_BINARY_DIR} --prefix ${_stage})
@@ -20,7 +20,7 @@ set_tests_properties(package.install_testing package.install_for_testing PROPERT
 
 # dfb_add_package_test(<name> HOW <how> [STAGE <folder>] [VERSION <version>] [COMPONENTS <component>...] [EXPECT <component>...]
 #                      [WITHOUT <package>...] [OPTIONS <option>...] [FAILS <regex>])
-# WITHOUT: packages that are not found, as on a machine that does not have them.
+# WITHOUT: packages that are hidden, as if the machine did not have them.
 function(dfb_add_package_test name)
   cmake_parse_arguments(PARSE_ARGV 1 A "" "HOW;STAGE;VERSION;FAILS" "COMPONENTS;EXPECT;WITHOUT;OPTIONS")
   if(NOT A_STAGE)
@@ -58,7 +58,7 @@ set(_name_of_mpi MPI)
 set(_name_of_tbb TBB)
 set(_name_of_snappy Snappy)
 
-# Everything, in three ways.
+# All components, in three ways.
 set(_minor ${PROJECT_VERSION_MAJOR}.${PROJECT_VERSION_MINOR})
 dfb_add_package_test(find_package HOW find_package VERSION ${_minor} EXPECT ${_others} OPTIONS -DFRAME=ON)
 foreach(_how add_subdirectory FetchContent)
@@ -70,8 +70,8 @@ foreach(_how add_subdirectory FetchContent)
   dfb_add_package_test(${_how} HOW ${_how} EXPECT ${_others} OPTIONS ${_options})
 endforeach()
 
-# Core alone, and each component alone, on a machine that has nothing else. Core has its frame below, where the library is
-# compiled once; header.dfb compiles it as headers.
+# Core alone, and each component alone, on a machine that has no other dependency. The frame with core is tested below,
+# with the compiled library; header.dfb compiles it as headers.
 dfb_add_package_test(find_package_core HOW find_package COMPONENTS core WITHOUT MPI TBB Snappy)
 dfb_add_package_test(add_subdirectory_core HOW add_subdirectory WITHOUT MPI TBB Snappy
   OPTIONS -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF)
@@ -82,8 +82,8 @@ foreach(_component IN LISTS _others)
     COMPONENTS ${_component} EXPECT ${_component} WITHOUT ${_without})
 endforeach()
 
-# The library compiled once, by the stranger's project: of the package, and, with core alone, of the sources.
-# With MPI it also builds what a stranger writes from the documentation alone.
+# The library compiled once, by the user's project: from the package and, with core alone, from the sources. With MPI it
+# also builds a program that was written from the documentation alone.
 set(_door "")
 if(TARGET dfb::mpi)
   set(_door -DDOOR=ON)
@@ -99,7 +99,8 @@ endif()
 dfb_add_package_test(add_subdirectory_compiled HOW add_subdirectory WITHOUT MPI TBB Snappy
   OPTIONS -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF -DFRAME=ON -DCOMPILED=ON)
 
-# By pkg-config and the compiler alone: all, core, and all where pkg-config does not know the dependencies.
+# With pkg-config and the compiler alone: all components, core, and all components if pkg-config does not know the
+# dependencies.
 find_program(DFB_PKG_CONFIG pkg-config)
 mark_as_advanced(DFB_PKG_CONFIG)
 if(DFB_PKG_CONFIG)
@@ -124,14 +125,14 @@ if(DFB_PKG_CONFIG)
   endif()
 endif()
 
-# What tests are made of, beside what is asked for.
+# The component testing, in addition to the requested ones.
 dfb_add_package_test(find_package_testing HOW find_package STAGE stage_testing COMPONENTS testing EXPECT testing
   WITHOUT MPI TBB Snappy)
 
-# What cannot be had is said clearly.
+# Requests that cannot be met give a clear error.
 dfb_add_package_test(find_package_misses_testing HOW find_package COMPONENTS testing
   FAILS "component 'testing' is not installed")
-# In versions 0.x each minor version has an interface of its own; of two patches the later one will do.
+# In versions 0.x each minor version has its own interface. A later patch satisfies a request for an earlier one.
 math(EXPR _earlier "${PROJECT_VERSION_MINOR} - 1")
 math(EXPR _later "${PROJECT_VERSION_MINOR} + 1")
 math(EXPR _patch "${PROJECT_VERSION_PATCH} + 1")

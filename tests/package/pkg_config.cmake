@@ -1,6 +1,7 @@
 # cmake -D CXX= -D MAIN= -D STAGE= -D BUILD= -D MODULE= -D VERSION= -D EXPECT= [-D SOURCE= -D OPTIONS=] -P pkg_config.cmake
-# Compiles main.cpp in the folder BUILD with what pkg-config says of MODULE, as installed in STAGE, and runs it. With
-# SOURCE, dfb is installed there first, by a build that finds no modules of pkg-config: then dfb.pc has the flags itself.
+# Compiles main.cpp in the folder BUILD with the flags that pkg-config gives for MODULE, as installed in STAGE, and runs
+# it. With SOURCE, first installs dfb there with a build that finds no pkg-config modules, so that dfb.pc has the flags
+# of dependencies itself.
 cmake_minimum_required(VERSION 3.21)
 
 file(REMOVE_RECURSE ${BUILD})
@@ -33,6 +34,6 @@ foreach(component MPI TBB SNAPPY TESTING)
     string(APPEND definitions " -DEXPECT_${component}=0")
   endif()
 endforeach()
-# What it says is for a shell to read: it escapes spaces in paths.
+# The flags are meant for a shell, with escaped spaces in paths.
 execute_process(COMMAND sh -xc "eval \"'${CXX}' -std=c++17 ${definitions} '${MAIN}' $(pkg-config --cflags --libs ${MODULE}) -o consumer\" && ./consumer"
   WORKING_DIRECTORY ${BUILD} COMMAND_ERROR_IS_FATAL ANY)

@@ -1,8 +1,8 @@
 # cmake -DRANKS=<n> -DVICTIM=<rank> -DREACTION=<abort|handler> -DWHERE=<where> -DBACK=<ON|OFF> -DNETWORK=<ON|OFF>
 #   -DTIMEOUT_MS=<ms> -DFOLDER=<folder> -P mpi_dead.cmake -- <mpiexec> <argument>... <program> <argument>...
-# Starts mpi_dead and looks at what it says: who was told of which rank, and when; or that the job was aborted in time.
-# BACK: the lost rank comes back, and is told, too. NETWORK: MPI may find out first, when it sends something there.
-# Ranks that are in a destructor cannot be told, but for those whose handler is called; they are gone in time.
+# Starts mpi_dead and checks its output: which ranks got an error about which rank, and when; or that the job was
+# aborted in time. BACK: the lost rank comes back and gets an error, too. NETWORK: MPI may find the loss first, when it
+# sends a message there. Ranks that are in a destructor cannot get an error, except in a handler; they end in time.
 cmake_policy(VERSION 3.16)
 file(REMOVE_RECURSE ${FOLDER})
 file(MAKE_DIRECTORY ${FOLDER})
@@ -20,8 +20,8 @@ if(REACTION STREQUAL "abort")
   if(code STREQUAL "0")
     message(SEND_ERROR "the job ended with code 0")
   endif()
-  # The first rank that notices ends the job for all. In a frame it may name another than the victim, for the reason
-  # below; that each rank names the right one is seen where the reaction is a handler.
+  # The first rank that notices the loss ends the job for all. In a frame it may name another rank than the victim, for
+  # the reason below. Runs with the reaction `handler` check that each rank names the right one.
   set(named ${VICTIM})
   if(WHERE STREQUAL "frame")
     set(named "[0-9]+")
@@ -38,8 +38,9 @@ else()
     if(rank EQUAL VICTIM AND NOT BACK)
       continue()
     endif()
-    # A rank that ends or is stopped while it sends may leave a place in the queue of MPI's shared memory that it never
-    # fills. Its receiver then gets nothing of others either, and may name one of those. That is one rank at most.
+    # A rank that ends or is stopped while it sends may leave a slot in the queue of MPI's shared memory that it never
+    # fills. Then its receiver gets no messages of other ranks either, and may name one of those. This concerns at most
+    # one rank.
     set(named ${VICTIM})
     if(WHERE MATCHES "^(pixels|shared)$" AND NOT NETWORK
         AND "${out}" MATCHES "mpi_dead: rank ${rank} told of rank ([0-9]+) [^\n]* Rank ([0-9]+) has heard nothing"

@@ -1,5 +1,5 @@
-# Runs the command behind "--", with `arguments` if that is set, for at most 60 s. Sets `code`, `out`, `err`, and how many
-# `seconds` it took.
+# Runs the command behind "--", followed by `arguments` if that is set, for at most 60 s. Sets `code`, `out`, `err`, and
+# `seconds`, the time that it took.
 set(command "")
 set(own OFF)
 foreach(i RANGE ${CMAKE_ARGC})

@@ -1,6 +1,6 @@
 # cmake -DTOLD=<count> -DSAID=<file> -P mpi_session.cmake -- <mpiexec> <argument>... <program> <argument>...
-# Starts an mpi_session that rank 1 leaves, with the file as its last argument. The job ends by itself, soon and with
-# code 1, once rank 1 has written to the file why, and so many other ranks that they were told.
+# Starts an mpi_session in which rank 1 leaves, with the file SAID as its last argument. The job must end by itself,
+# soon and with code 1, after rank 1 has written the reason to the file, and TOLD other ranks their errors.
 cmake_policy(VERSION 3.16)
 file(WRITE ${SAID} "")
 set(arguments ${SAID})

@@ -37,7 +37,7 @@ failed() {
     verdict=FAILED
 }
 
-# python RANKS ARGUMENT...: runs it on ranks of mpi4py.
+# python RANKS ARGUMENT...: runs Python on ranks of mpi4py.
 python() {
     ranks=$1
     shift
@@ -59,8 +59,8 @@ for count in 1 2 3 5; do
     done
 done
 
-# The ranks that are left hear of it, and the job ends with an error, also without -m mpi4py, which would end it at once.
-# 124 would be a hang.
+# The remaining ranks get the error and the job ends with one, also without -m mpi4py, which would end it at once. A
+# hang would give 124.
 code=0
 python 3 /dfb/tests/python/mpi.py leaves >"$said" 2>&1 || code=$?
 if [ $code = 0 ] || [ $code -ge 124 ] || ! grep -q "heard: Transport of rank 2" "$said" ||

@@ -1,5 +1,6 @@
-# Looks for the compiler that is not in use: clang++ beside GCC, g++ beside Clang. Sets DFB_OTHER_CXX to its path, and
-# DFB_OTHER_CXX_WORKS to whether it is what it is called (g++ may be Clang) and makes a program of what the tests need.
+# Looks for another compiler than the one in use: clang++ if that is GCC, g++ if it is Clang. Sets DFB_OTHER_CXX to its
+# path, and DFB_OTHER_CXX_WORKS to whether it really is that compiler (g++ may be Clang) and can build what the tests
+# need.
 set(DFB_OTHER_CXX_WORKS OFF)
 if(CMAKE_CROSSCOMPILING OR NOT CMAKE_CXX_COMPILER_ID MATCHES "^(GNU|Clang|AppleClang)$")
   message(STATUS "dfb: no results are compared with another compiler's: there is none to go with this one")

@@ -1,9 +1,9 @@
 #!/bin/sh
 # sh tests/trace/speedscope.sh [--only-if-installed] [OUTPUT FOLDER]
-# Opens a trace of dfb_render in speedscope, in Debian's Chromium, and writes a screenshot to the output folder,
-# build/speedscope. Installs speedscope and puppeteer-core into ~/.cache/dfb-live (or $DFB_LIVE_NODE_MODULES), and builds
-# dfb_render (preset "release", unless $DFB_RENDER says where it is). $DFB_TRACE: a trace to show in place of its own.
-# With --only-if-installed: exits with 77 where something is missing.
+# Opens a trace of dfb_render in speedscope, in Debian's Chromium, and writes a screenshot to the output folder
+# (default: build/speedscope). Installs speedscope and puppeteer-core into ~/.cache/dfb-live (or
+# $DFB_LIVE_NODE_MODULES), and builds dfb_render (preset "release", unless $DFB_RENDER says where it is). $DFB_TRACE: a
+# trace to show instead of a new one. With --only-if-installed: exits with 77 if something is missing.
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/../.." && pwd)
 script=tests/trace/speedscope.sh
