@@ -1,4 +1,4 @@
-// Makes by the interface of C++ the pictures of the programs in C and Fortran, to compare them:
+// Makes the pictures of the programs in C and Fortran with the C++ interface, to compare them:
 //   mpirun -n 3 test_c_twin pictures FILE                as `test_c_pictures write FILE`
 //   mpirun -n 3 test_c_twin minimal FILE                 as minimal_c
 //   mpirun -n 3 test_c_twin heat FILES STEPS EVERY       as `heat STEPS EVERY`; FILES0000.ppm and so on

@@ -1,3 +1,4 @@
+// Runs the conformance suite on InprocTransport, also with faults put in. 1 to 5 ranks, which are threads.
 #include "catch.hpp"
 #include "shuffled.hpp"
 

@@ -1,3 +1,4 @@
+// Runs the conformance suite on MpiTransport, also with faults put in. Over MPI, on any number of ranks.
 #include "catch.hpp"
 #include "ranks.hpp"
 

@@ -1,1 +1,1 @@
-// Nothing: the headers come from the command line.
+// Empty: the command line includes the headers.

@@ -1,5 +1,5 @@
-// A framebuffer inside the user's OpenMP code: tiles are rendered and set by its threads, frames begun and ended
-// outside; and framebuffers that belong to a thread each.
+// A framebuffer in a user's OpenMP code: OpenMP threads render and set tiles, while frames are begun and ended outside
+// of parallel regions. Also framebuffers that each belong to one thread.
 #include "catch.hpp"
 #include "random_scene.hpp"
 

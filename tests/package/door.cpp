@@ -1,5 +1,5 @@
-// What a stranger builds from the documentation alone: finished images to one picture, an operation and a loop of one's
-// own, a viewer that polls, another size, an orthographic camera. Exits with 0 if each works, with any number of ranks.
+// A program that a user builds from the documentation alone: finished images become one picture; a user's operation and
+// loop; a viewer that polls; another size; an orthographic camera. Exits with 0 if all work, with any number of ranks.
 #include <dfb/dfb.hpp>
 
 #include <algorithm>

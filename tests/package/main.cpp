@@ -1,5 +1,5 @@
-// One use of each component that should be there; with WITH_FRAME all of dfb is included and a frame made over two
-// ranks that are threads, which takes most of the time to compile.
+// Uses each component that should be there. With WITH_FRAME it includes all of dfb and renders a frame on two ranks,
+// which are threads; this takes most of the compile time.
 #if WITH_FRAME
 #include <dfb/dfb.hpp>
 #else

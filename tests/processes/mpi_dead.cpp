@@ -1,13 +1,13 @@
-// A rank that dies or hangs under MPI: the others say which, in time, and come to an end.
+// A rank that dies or hangs under MPI: the other ranks must say which rank it is, in time, and come to an end.
 //   mpirun -n 4 mpi_dead <how> <where> <reaction> <victim> <folder>
 //     how:      kill (SIGKILL), exit (without MPI_Finalize), stop (SIGSTOP), resume (SIGSTOP, and SIGCONT later)
-//     where:    constructor, frame (while rendering), pixels (the same, with tiles on their way to and from everybody),
+//     where:    constructor, frame (while rendering), pixels (the same, with tiles on their way to and from all ranks),
 //               shared (the same, with pixels that others read in the memory of the rank), reduction (between frames),
 //               end (destruction)
 //     reaction: abort (the default: MPI_Abort), handler (the other ranks go on, as far as they can)
-// Launchers end a job when a rank dies, in most cases, or do not let it live on. Therefore each process forks first:
-// what the launcher sees goes on until all ranks have been told, whatever has become of the rank itself. So this is the
-// case in which nobody but the library notices. mpi_dead.cmake starts it and looks at what it prints:
+// Most launchers end a job when a rank dies, or do not let it live on. Therefore each process forks first. The process
+// that the launcher sees lives until all ranks have got their errors, whatever happens to the rank itself. So only the
+// library can notice the loss. mpi_dead.cmake starts this program and checks its output:
 //   mpi_dead: rank 0 told of rank 3 after 1234 ms, gone after 5 ms: <error>
 // <folder> must be empty.
 #include <dfb/dfb.hpp>

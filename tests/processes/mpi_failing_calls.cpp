@@ -1,5 +1,5 @@
-// mpirun -n 2 mpi_failing_calls: what MPI says of a call that fails, on one rank or on all, comes out of the library on
-// all ranks, with the call's name. Returns 0 if all is well.
+// mpirun -n 2 mpi_failing_calls: if an MPI call fails on one rank or on all, all ranks get an error with MPI's message
+// and the call's name. Returns 0 if all is well.
 #include <dfb/dfb.hpp>
 
 #include <atomic>

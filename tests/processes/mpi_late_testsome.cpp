@@ -1,6 +1,6 @@
-// mpirun -n 2 mpi_late_testsome: one poll() delivers what has come, also where MPI_Testsome returns what it knew before
-// the call and only then looks for more, as that of Open MPI does. A rank that naps after such a poll would sleep
-// beside the message. This program makes every MPI_Testsome so. Returns 0 if all is well.
+// mpirun -n 2 mpi_late_testsome: one poll() delivers all messages that have arrived, even if MPI_Testsome returns only
+// what it knew before the call and then looks for more, as Open MPI's does. Otherwise a rank might nap after such a
+// poll while a message waits. This program makes every MPI_Testsome behave so. Returns 0 if all is well.
 #include <dfb/comm/mpi_session.hpp>
 #include <dfb/comm/mpi_transport.hpp>
 

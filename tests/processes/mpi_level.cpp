@@ -1,8 +1,7 @@
-// A program that has initialised MPI at any thread level gets its images with default settings: rank by rank a progress
-// thread moves messages, or, below MPI_THREAD_MULTIPLE, the caller does, and then no other thread calls MPI. And what
-// the constructor says where Progress::Thread cannot be had, and of MPI that is not there. MPI can be initialised once
-// a process:
-//   mpirun -n 2 mpi_level single|funneled|serialized|multiple
+// A program that has initialised MPI at any thread level gets its images with default settings. On each rank a progress
+// thread moves messages or, below MPI_THREAD_MULTIPLE, the caller does, and then no other thread calls MPI. Also tests
+// the errors of the constructor if Progress::Thread is not possible, and if MPI is not initialised. MPI can be
+// initialised only once in a process:
 //   mpirun -n 2 mpi_level mixed      rank 0 with MPI_Init, the others at MPI_THREAD_MULTIPLE
 // Returns 0 if all is well.
 #include <dfb/dfb.hpp>

@@ -1,4 +1,5 @@
-// What MpiSession does at the beginning and the end of MPI. As MPI can be initialised once a process, a run each:
+// MpiSession at the beginning and the end of MPI. One run for each case, as MPI can be initialised only once in a
+// process:
 //   mpirun -n 3 mpi_session multiple     mpirun -n 3 mpi_session funneled
 //   mpirun -n 3 mpi_session highest      without a level: what the MPI library has, if that is a low one, too
 //   mpirun -n 3 mpi_session lower        the MPI library has a lower thread level than is asked for

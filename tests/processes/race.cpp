@@ -1,5 +1,5 @@
-// Two threads of the library that write the same ints and have not said a word to each other: ThreadSanitizer must find
-// it, or its silence in the other tests means nothing. Only built with -fsanitize=thread.
+// Two threads of the library that write the same ints without synchronisation. ThreadSanitizer must find this race,
+// otherwise its silence in the other tests means nothing. Only built with -fsanitize=thread.
 //   test_race executor     two threads of a ThreadExecutor
 //   test_race ranks        two ranks in one process, each in its renderer
 #include <dfb/dfb.hpp>

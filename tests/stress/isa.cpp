@@ -1,5 +1,5 @@
-// Composites adversarial tiles and writes all values to a file; or says by how much two such files differ: in no bit,
-// if MOST_ULPS is 0. It is built for several instruction sets and by two compilers.
+// Composites adversarial tiles and writes all values to a file, or compares two such files, whose values may differ by
+// MOST_ULPS; 0: not in a single bit. Built for several instruction sets and by two compilers.
 //   isa write FILE        isa compare FILE FILE MOST_ULPS
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/adversarial.hpp>

@@ -1,5 +1,5 @@
-// Numbers that break sums: very many layers, the ends of every range, and values of very different size, against the
-// reference. The long form: test_stress "[long]".
+// Numbers for which sums go wrong: very many layers, the ends of all ranges, and values of very different size.
+// Compared with the reference. The long form: test_stress "[long]".
 #include "catch.hpp"
 
 #include <dfb/ops/image_parallel.hpp>

@@ -1,4 +1,5 @@
-// The same image, bit for bit, whatever order inputs come in and however they travelled; and on other instruction sets.
+// The image is the same, bit for bit, whatever the arrival order of inputs, the way they travel, and the instruction
+// set.
 #include "catch.hpp"
 
 #include <dfb/ops/image_parallel.hpp>

@@ -1,6 +1,6 @@
-// Adversarial images of several ranks, by every way in which they can travel: copied, read where they lie, as floats
-// or bytes, in an order, with a codec. Against the reference, and the same bit for bit. What is rounded keeps its
-// bound.
+// Adversarial images of several ranks, which are threads, in every way in which they can travel: copied, read in place,
+// as floats or bytes, in an order, with a codec. They are compared with the reference, and are the same bit for bit.
+// Rounded values keep their error bound.
 #include "catch.hpp"
 
 #include <dfb/comm/inproc_transport.hpp>

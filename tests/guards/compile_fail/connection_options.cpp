@@ -1,4 +1,4 @@
-// How messages travel is said once, to the connection: a framebuffer that is given one has no place to say it again.
+// NetworkConfig is given to the connection, so a framebuffer on an existing connection does not accept it again.
 #include <dfb/dfb.hpp>
 
 #include <memory>

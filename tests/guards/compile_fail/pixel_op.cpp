@@ -1,4 +1,4 @@
-// An archetype: nothing but what a PixelOp must have; each case takes one part away.
+// An archetype, which has only what a PixelOp must have. Each case leaves out one part.
 #include <dfb/dfb.hpp>
 
 struct Op {

@@ -1,4 +1,4 @@
-// An archetype: nothing but what a TileOp must have; each case takes one part away.
+// An archetype, which has only what a TileOp must have. Each case leaves out one part.
 #include <dfb/dfb.hpp>
 
 struct Op {

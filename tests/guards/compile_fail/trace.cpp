@@ -1,4 +1,4 @@
-// A sink cannot throw: it is called in destructors and with locks held.
+// A sink must not throw, as it is called in destructors and with locks held.
 #include <dfb/trace.hpp>
 
 class Sink final : public dfb::TraceSink {

@@ -1,4 +1,4 @@
-// What the blocks of code in docs/ take as given; see docs/recipes.md. Of this only the operations are run.
+// Declares what the blocks of code in docs/ assume; see docs/recipes.md. Only the operations are run.
 #pragma once
 
 #include <dfb/dfb.hpp>

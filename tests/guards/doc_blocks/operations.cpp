@@ -1,4 +1,4 @@
-// The operations that docs/ has as code keep the contract, and do what the text says of them.
+// The operations in docs/ keep the contract, and do what the text says.
 #include "Brightest.hpp"
 #include "Gamma.hpp"
 #include "SortAndBlend.hpp"

@@ -1,4 +1,4 @@
-// As compiled with dfb::compiled; see headers.cpp.
+// The file that is compiled with dfb::compiled; see headers.cpp.
 #define DFB_COMPILED
 #include <dfb/comm/inproc_transport.hpp>
 #include <dfb/frame/engine.hpp>

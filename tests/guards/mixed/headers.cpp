@@ -1,4 +1,4 @@
-// With compiled.cpp: a program of which one file has the library as headers, and one links dfb::compiled.
+// With compiled.cpp, a program in which one file uses the library as headers and the other links dfb::compiled.
 #include <dfb/compiled.hpp>
 
 int compiled();

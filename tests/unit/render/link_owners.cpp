@@ -1,3 +1,4 @@
+// LinkOwners: owners of tiles that keep the traffic on the links between nodes low.
 #include <dfb/render/link_owners.hpp>
 
 #include "catch.hpp"

@@ -1,4 +1,4 @@
-// ErrorReport: how far an image is off the exact one.
+// ErrorReport: how much an image differs from the exact one.
 #pragma once
 
 #include <dfb/testing/reference.hpp>

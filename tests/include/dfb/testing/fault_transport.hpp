@@ -1,5 +1,5 @@
-// FaultTransport: any transport, with faults put in on the sending side. For tests. Messages that are late or out of
-// order keep the contract of a transport; messages twice, lost or damaged break it.
+// FaultTransport: wraps any transport and puts in faults on the sending side. For tests. Messages that are late or out
+// of order keep the contract of a transport. Messages that are repeated, lost or damaged break it.
 #pragma once
 
 #include <dfb/comm/inproc_transport.hpp>

@@ -1,5 +1,5 @@
-// Parts of the conformance suite of transports: messages that can be checked, their arrival, expectations, and a thread
-// that polls. Not for users.
+// Parts of the conformance suite of transports: messages that can be checked, a record of their arrival, expectations,
+// and a thread that polls. Not for users.
 #pragma once
 
 #include <dfb/comm/transport.hpp>
