@@ -84,8 +84,7 @@ TEST_CASE("Ranks whose CPU masks meet divide the processors; those with masks of
     CHECK(sharingRanks() == same);
 
     // Rank 0 has all processors, each other rank has one. Rank 0 shares with all, the others only with rank 0 and with
-    // ranks
-    // that have the same processor.
+    // ranks that have the same processor.
     share(rank == 0 ? everybodys : std::vector<int>{everybodys[static_cast<std::size_t>(rank % processors)]});
     same = 0;
     for (int other = 0; other < size; ++other)
