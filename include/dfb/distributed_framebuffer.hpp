@@ -308,7 +308,7 @@ public:
     {
     }
 
-    // The same, with a network configuration of your own.
+    // As above, with a network configuration of your own.
     DistributedFrameBuffer(const Communicator& communicator, Config config, NetworkConfig network, PixelOp pixelOp = {})
         : DistributedFrameBuffer(connect<Transport>(communicator, std::move(network)), std::move(config),
                                  std::move(pixelOp))

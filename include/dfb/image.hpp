@@ -367,7 +367,7 @@ double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int
         const double threshold = (detail::ditherRank(x + i, y) + 0.5) / 64, exactAlpha = rgba[3];
         farthest = std::max(farthest, detail::toUnorm8(&exactAlpha, 1, bytes + 3));
         const auto alpha = static_cast<float>(rgba[3]);
-        // What is a tie in float may go either way in the exact alpha, which has more digits.
+        // A tie in float may go either way in the exact alpha, which has more digits.
         const int most = isSrgb ? detail::toSrgb8(static_cast<double>(alpha)) : detail::ditherUnorm8(alpha, 0.5001);
         for (int c = 0; c < 3; ++c) {
             const auto value = static_cast<float>(rgba[c]);

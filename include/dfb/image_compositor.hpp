@@ -115,7 +115,7 @@ public:
     // must have one pass and no samples. If config.executor was not given and this rank's share is one processor, the
     // calling thread does all the work. Collective. Waits as end(). Throws what start() and end() throw.
     FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {});
-    // The same for the other ways to blend, which need no place.
+    // For ImageBlend::Nearest and ByDepth, which need no place; else as above.
     FrameReport composite(const InputImage& image, const FrameConfig& frame = {})
     {
         return composite(image, -1, frame);

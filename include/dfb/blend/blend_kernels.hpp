@@ -88,7 +88,7 @@ bool blendBlock(double* rgba, double* transmittance, int count, bool isFirst, in
     return !isOpaque(transmittance, count);
 }
 
-// The same for a group, from `pixel` on. `rgba` and `transmittance` are those of the group's first pixel.
+// Blends a group, from `pixel` on. `rgba` and `transmittance` are those of the group's first pixel.
 template <bool HasLeast>
 bool blendBlock(double* rgba, double* transmittance, std::ptrdiff_t pixel, int count, const BlendGroup& group)
 {

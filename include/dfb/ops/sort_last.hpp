@@ -489,8 +489,8 @@ inline bool areOpaque(const std::byte* rgba, int count)
     return all == std::byte{255};
 }
 
-// The same for DepthComposite with inputs of 8 bits a channel. An image of 8 bits gets their pixels as they are where
-// no background shows through.
+// Finishes a tile of DepthComposite whose inputs have 8 bits a channel. An image of 8 bits gets their pixels as they
+// are where no background shows through.
 DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
 {
     Scratch& scratch = start();

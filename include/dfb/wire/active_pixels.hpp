@@ -253,7 +253,7 @@ struct RowInPlace {
     Span span;
     const float* color = nullptr;
     const float* depth = nullptr; // null: not wanted
-    // The same of a later row, to be prefetched meanwhile.
+    // Colour and depth of a later row, to be prefetched meanwhile.
     const float *colorAhead = nullptr, *depthAhead = nullptr;
 };
 

@@ -48,7 +48,8 @@ public:
     // The largest size of a record with so many pixels.
     std::size_t mostBytes(std::size_t pixels) const { return alignedTo16(sizeof(Header) + pixelBytes() * pixels); }
 
-    // What is to be written of a tile, found by one pass over it. Reuse it from tile to tile, as it keeps its memory.
+    // The parts of a tile that are to be written, found by one pass over it. Reuse it from tile to tile, as it keeps
+    // its memory.
     class Plan {
     public:
         std::size_t bytes() const noexcept { return bytes_; }

@@ -141,7 +141,7 @@ DFB_INLINE bool arePixelsInRange(const float* rgba, int count, float maxColor) n
     return out == 0;
 }
 
-// The same loops with AVX2 and F16C: whole blocks at once, and the rest as above.
+// These loops with AVX2 and F16C: whole blocks at once, and the rest as above.
 #if defined(DFB_HAS_AVX2_CLONES)
 constexpr int toNearest = _MM_FROUND_TO_NEAREST_INT;
 // The factors for two pixels.

@@ -418,7 +418,7 @@ private:
             trouble = hopeless();
             return !trouble.empty() || ready();
         };
-        // What is missing here says more than that another rank gave up.
+        // The thing that is missing here says more than that another rank gave up.
         if (!waitUntil(over, deadline) || (!trouble.empty() && Clock::now() >= deadline))
             throw GaveUp(what());
         if (!trouble.empty())

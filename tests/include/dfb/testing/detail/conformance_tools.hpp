@@ -150,7 +150,7 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         failsAt_ = time;
     }
-    // What interrupts the transport. Before its start.
+    // Sets the function that interrupts the transport. Call it before the transport starts.
     void setInterrupt(std::function<void()> interrupt) { interrupt_ = std::move(interrupt); }
     // Whether each message that comes does so, within receive().
     void interruptOnReceive(bool interrupts) { interrupts_ = interrupts; }
