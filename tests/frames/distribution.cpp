@@ -108,6 +108,10 @@ struct OtherBounds {
             const dfb::SharedWorld world(fb, dfb::World({{7, {{0, 0, 0}, {wide, 1, 1}}}}));
         });
         result.expect(fb.size() == 1 ? outcome == "fine" : scene::has(outcome, "brick 7 has other bounds"), outcome);
+        // 0 and -0 are the same place.
+        const float zero = fb.rank() == 0 ? -0.0f : 0.0f;
+        const dfb::SharedWorld one(fb, dfb::World({{1, {{zero, 0, 0}, {1, 1, 1}}}}));
+        result.expect(one.bricks().size() == 1, "a brick that begins at 0 and at -0");
         // Two ids with the same bounds are two bricks.
         const dfb::SharedWorld world(fb, dfb::World({{1, {{0, 0, 0}, {1, 1, 1}}}, {2, {{0, 0, 0}, {1, 1, 1}}}}));
         result.expect(world.bricks().size() == 2, "two bricks with equal bounds");

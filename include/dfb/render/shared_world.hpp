@@ -57,7 +57,7 @@ public:
             if (bricks_.empty() || bricks_.back().id != brick.id)
                 bricks_.push_back({brick, {}});
             SharedBrick& shared = bricks_.back();
-            if (std::memcmp(&shared.bounds, &brick.bounds, sizeof brick.bounds) != 0)
+            if (!(shared.bounds == brick.bounds))
                 detail::failArgument("brick %u has other bounds on rank %d than on rank %d", brick.id, rank,
                                      shared.ranks.front());
             if (!shared.ranks.empty() && shared.ranks.back() == rank)
@@ -106,10 +106,9 @@ private:
 DFB_COMPILED_ONCE const char* FrontToBack::find(const SharedWorld& world, const Vec3& eye)
 {
     const auto& bricks = world.bricks();
-    const auto same = [](const auto& a, const auto& b) { return std::memcmp(&a, &b, sizeof a) == 0; }; // also of NaNs
-    if (same(eye, eye_)
+    if (std::memcmp(&eye, &eye_, sizeof eye) == 0 // also of NaNs
         && std::equal(bricks.begin(), bricks.end(), boxes_.begin(), boxes_.end(),
-                      [&](const Brick& brick, const Box3& box) { return same(brick.bounds, box); }))
+                      [](const Brick& brick, const Box3& box) { return brick.bounds == box; }))
         return why_;
     order_.reserve(bricks.size()); // nothing may throw once boxes_ is set
     inFront_.reserve(bricks.size());
