@@ -14,6 +14,7 @@
 
 #include <cstdint>
 #include <cstdio>
+#include <limits>
 #include <string>
 #include <utility>
 #include <vector>
@@ -186,6 +187,7 @@ struct Scene {
             },
             loaders);
         requireAnyOf(seen, name, box);
+        noteSteps(name, box);
         for (Sphere& sphere : share.spheres) {
             sphere.center = place.toWorld(sphere.center);
             sphere.radius *= place.size();
@@ -255,6 +257,7 @@ private:
             },
             loaders);
         requireAnyOf(seen, name, box);
+        noteSteps(name, box);
         for (Vec3& p : mesh.positions)
             p = place.toWorld(p);
         grow(seen);
@@ -279,6 +282,22 @@ private:
         notes.push_back(source.name + ": there is nothing to see: "
                         + (lo == hi ? "all voxels are " + textOf(lo)
                                     : "all voxels, from " + textOf(lo) + " to " + textOf(hi) + ", are transparent"));
+    }
+    // Coordinates are float32, whose steps grow with the distance from 0: adds a note if they can be seen. `box`: the
+    // file's box in its own coordinates.
+    void noteSteps(const std::string& name, const Box& box)
+    {
+        float step = 0;
+        for (const Vec3& corner : {box.lo, box.hi})
+            for (int axis = 0; axis < 3 && !box.empty(); ++axis) {
+                const float far = std::fabs(component(corner, axis));
+                step = std::max(step, std::nextafter(far, std::numeric_limits<float>::max()) - far);
+            }
+        const float extent = box.empty() ? 0 : box.largestExtent();
+        if (extent > 0 && step > extent / 2048)
+            notes.push_back(name + ": its coordinates, from " + textOf(box.lo) + " to " + textOf(box.hi)
+                            + ", were rounded to steps of " + textOf(step)
+                            + ", as float32 has them: subtract the position of its centre to see more");
     }
     // Throws if nothing of a file is seen in the world. `box` is the file's box in its own coordinates.
     static void requireAnyOf(const Box& seen, const std::string& name, const Box& box)

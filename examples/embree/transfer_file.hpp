@@ -21,8 +21,8 @@
 namespace example {
 
 struct TransferFile {
-    TransferPoints points;    // sRGB
-    std::vector<float> range; // of the data; empty: "auto". Points then have values from 0 to 1, else any
+    TransferPoints points;    // in sRGB; value 0 stands for the start of the range, 1 for its end
+    std::vector<float> range; // start and end, in values of the data; empty: "auto"
 };
 
 // Throws std::runtime_error that names the file and what is wrong.

@@ -48,6 +48,25 @@ TEST_CASE("All ranks have the same notes for the user", "[scene]")
     CHECK(loadRankScene(optionsFor({"synthetic"}), {}).notes.empty());
 }
 
+TEST_CASE("Coordinates far from 0 are noted where float32 rounds them visibly", "[scene]")
+{
+    const test::TemporaryFolder folder;
+    const std::string mesh = folder.write("far.obj", "v 5000000 0 0\nv 5000200 0 0\nv 5000000 200 0\nf 1 2 3\n"),
+                      atoms = folder.write("far.xyz", "2\n\nC 0 0 -5000000\nC 9 9 -5000000\n"),
+                      fine = folder.write("fine.obj", "v 50000 0 0\nv 50200 0 0\nv 50000 200 0\nf 1 2 3\n");
+    for (const int ranks : {1, 3})
+        for (const Notes& notes : test::ofRanks<Notes>(
+                 ranks, [&](const Loaders& loaders) { return loadRankScene(optionsFor({mesh, atoms}), loaders).notes; })) {
+            REQUIRE(notes.size() == 2);
+            CHECK(test::contains(notes[0], "far.obj: its coordinates, from 5e+06,0,0 to "));
+            CHECK(test::contains(notes[0], " to steps of 0.5"));
+            CHECK(test::contains(notes[1], "far.xyz: "));
+        }
+    CHECK(loadRankScene(optionsFor({fine}), {}).notes.empty());
+    const std::string point = folder.write("point.obj", "v 5000000 0 0\nf 1 1 1\n");
+    CHECK(loadRankScene(optionsFor({point}), {}).notes.empty());
+}
+
 TEST_CASE("Path tracing says that it leaves volumes out", "[scene]")
 {
     const test::TemporaryFolder folder;
