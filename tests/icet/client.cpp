@@ -120,6 +120,10 @@ void tryWithoutContext()
     expectError(ICET_INVALID_OPERATION, "a client's own communicator");
     expect(icetCreateContext(nullptr) == nullptr, "a context of no communicator");
     expectError(ICET_INVALID_VALUE, "no communicator");
+    IceTCommunicator none = icetCreateMPICommunicator(MPI_COMM_NULL); // as on ranks outside of a part of the job
+    expect(none == nullptr, "a communicator of MPI_COMM_NULL");
+    icetDestroyMPICommunicator(none);
+    expectError(ICET_NO_ERROR, "MPI_COMM_NULL");
 }
 
 void trySettings()
@@ -208,10 +212,51 @@ void draw(const IceTDouble*, const IceTDouble*, const IceTFloat*, const IceTInt*
         expectError(ICET_INVALID_OPERATION, "a frame within a frame");
         icetSetColorFormat(ICET_IMAGE_COLOR_RGBA_FLOAT);
         expectError(ICET_INVALID_OPERATION, "a format within a frame");
+        icetResetTiles();
+        expectError(ICET_INVALID_OPERATION, "no tiles within a frame");
+        expect(icetAddTile(0, 0, 4, 4, ranks - 1) == -1, "a tile within a frame");
+        expectError(ICET_INVALID_OPERATION, "a tile within a frame");
+        icetPhysicalRenderSize(400, 300);
+        expectError(ICET_INVALID_OPERATION, "a render size within a frame");
+        icetCopyState(icetGetContext(), icetGetContext());
+        expectError(ICET_INVALID_OPERATION, "a copied state within a frame");
+        icetDestroyContext(icetGetContext());
+        expectError(ICET_INVALID_OPERATION, "the end of a context within a frame");
     }
     const Picture picture(40, 30);
     std::copy(picture.colors.begin(), picture.colors.end(), icetImageGetColorui(image));
     std::copy(picture.depths.begin(), picture.depths.end(), icetImageGetDepthf(image));
+}
+
+// The client may render less than a tile: the rest of the tile stays empty.
+void trySmallRender()
+{
+#if defined(ICET_IMAGE_COLOR_RGB_FLOAT)
+    const IceTEnum format = ICET_IMAGE_COLOR_RGB_FLOAT;
+    constexpr int channels = 3;
+#else
+    const IceTEnum format = ICET_IMAGE_COLOR_RGBA_FLOAT;
+    constexpr int channels = 4;
+#endif
+    icetSetColorFormat(format);
+    icetPhysicalRenderSize(8, 4);
+    expectError(ICET_INVALID_VALUE, "a render size below that of the tile"); // a warning
+    icetDrawCallback([](const IceTDouble*, const IceTDouble*, const IceTFloat*, const IceTInt* read, IceTImage image) {
+        expect(read[0] == 0 && read[1] == 0 && read[2] == 8 && read[3] == 4, "what is read of a small render");
+        expect(icetImageGetWidth(image) == 8 && icetImageGetHeight(image) == 4, "the size of a small render");
+        std::fill_n(icetImageGetColorf(image), channels * 8 * 4, 0.5f);
+        std::fill_n(icetImageGetDepthf(image), 8 * 4, 0.5f);
+    });
+    const IceTImage image = icetDrawFrame(identity, identity, black);
+    expectError(ICET_NO_ERROR, "a small render");
+    expect(icetImageIsNull(image) == (rank != 0), "an image of a small render");
+    if (rank == 0)
+        for (int i = 0; i < 40 * 30; ++i)
+            expect(icetImageGetColorf(image)[channels * i] == (i % 40 < 8 && i / 40 < 4 ? 0.5f : 0.0f),
+                   "pixel " + std::to_string(i) + " of a small render");
+    icetPhysicalRenderSize(40, 30);
+    icetSetColorFormat(ICET_IMAGE_COLOR_RGBA_UBYTE);
+    expectGoodFrame("a small render");
 }
 
 void tryFrames()
@@ -256,6 +301,7 @@ void tryFrames()
     expectError(ICET_INVALID_VALUE, "depth where colors are blended"); // a warning
     expect(icetImageIsNull(image) == (rank != 0), "a blended picture");
     icetCompositeMode(ICET_COMPOSITE_MODE_Z_BUFFER);
+    trySmallRender();
     icetResetTiles();
     expect(icetImageIsNull(picture.composite()), "a picture without tiles");
     expectError(ICET_NO_ERROR, "a picture without tiles");

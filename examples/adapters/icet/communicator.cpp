@@ -30,6 +30,8 @@ IceTCommunicator make(MPI_Comm from)
     MPI_Initialized(&isThere);
     if (!isThere)
         throw Error(ICET_INVALID_OPERATION, "MPI is not initialised");
+    if (from == MPI_COMM_NULL) // on ranks outside of a part of the job
+        return nullptr;
     auto* comm = new IceTCommunicatorStruct{};
     comm->data = new MPI_Comm(MPI_COMM_NULL);
     MPI_Comm_dup(from, &commOf(comm));
@@ -68,7 +70,10 @@ extern "C" IceTCommunicator icetCreateMPICommunicator(MPI_Comm comm)
 
 extern "C" void icetDestroyMPICommunicator(IceTCommunicator communicator)
 {
-    guarded("icetDestroyMPICommunicator", [&] { mpiOf(communicator), destroy(communicator); });
+    guarded("icetDestroyMPICommunicator", [&] {
+        if (communicator)
+            mpiOf(communicator), destroy(communicator);
+    });
 }
 
 } // namespace dfb_icet

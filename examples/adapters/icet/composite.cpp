@@ -285,7 +285,7 @@ IceTImage makeFrame(IceTContextStruct& context, const View& view, const Source& 
         throw Error(ICET_INVALID_OPERATION, "MPI has been finalised");
     Frame& frame = context.frame;
     ++frame.count;
-    frame.isPreRendered = source.isPreRendered;
+    frame.isPreRendered = source.limits != nullptr;
     frame.renderSeconds = 0;
     frame.background = {};
     if (view.background)
@@ -328,7 +328,7 @@ extern "C" IceTImage icetCompositeImage(const IceTVoid* color, const IceTVoid* d
             return inputOf(context, image, wall, context.frame.contained,
                            context.settings.tiles[static_cast<std::size_t>(tile)].viewport);
         };
-        return makeFrame(context, {projection, modelview, background}, {true, &limits, input});
+        return makeFrame(context, {projection, modelview, background}, {&limits, input});
     };
     return guarded("icetCompositeImage", composite);
 }

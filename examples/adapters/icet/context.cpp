@@ -108,6 +108,12 @@ int Settings::tileOf(int displayRank) const
     return place == tiles.end() ? -1 : static_cast<int>(place - tiles.begin());
 }
 
+void requireNotDrawing(const IceTContextStruct& context)
+{
+    if (context.isDrawing)
+        throw Error(ICET_INVALID_OPERATION, "not while a frame is drawn");
+}
+
 double secondsNow()
 {
     return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
@@ -137,6 +143,7 @@ extern "C" void icetDestroyContext(IceTContext context)
 {
     guarded("icetDestroyContext", [&] {
         requireThere(context);
+        requireNotDrawing(*context);
         if (context == current)
             current = nullptr;
         delete context;
@@ -159,6 +166,7 @@ extern "C" void icetCopyState(IceTContext to, const IceTContext from)
     guarded("icetCopyState", [&] {
         requireThere(to);
         requireThere(from);
+        requireNotDrawing(*to);
         to->settings = from->settings;
     });
 }

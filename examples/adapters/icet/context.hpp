@@ -87,13 +87,16 @@ struct View {
     const IceTFloat* background;
 };
 
-// Where this rank's pixels come from: `limits`, if not null, is the part of the wall outside of which there are none;
-// `input` returns the input of a tile. An exception fails the frame on all ranks.
+// Where this rank's pixels come from: `limits` is the part of the wall outside of which there are none, null if the
+// client renders when it is called back; `input` returns the input of a tile. An exception fails the frame on all
+// ranks.
 struct Source {
-    bool isPreRendered = false;
     const Region* limits = nullptr;
     std::function<dfb::InputImage(int tile)> input;
 };
+
+// Throws if a frame is drawn: the client calls from its draw callback.
+void requireNotDrawing(const IceTContextStruct& context);
 
 // Makes a frame and returns the picture of this rank's tile, if it displays one. Collective.
 IceTImage makeFrame(IceTContextStruct& context, const View& view, const Source& source);

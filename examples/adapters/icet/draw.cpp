@@ -25,7 +25,8 @@ Window windowFor(const IceTContextStruct& context, const Region& tile)
     const bool fits = all.width() <= width && all.height() <= height;
     if (s.isEnabled(ICET_FLOATING_VIEWPORT) && fits && intersection(tile, all) != all)
         return {viewport(all.x0, all.y0, width, height), all, true};
-    return {viewport(tile.x0, tile.y0, width, height), intersection(tile, all), false};
+    const Region shown = viewport(tile.x0, tile.y0, width, height); // a client may make it smaller than the tile
+    return {shown, intersection(intersection(tile, all), shown), false};
 }
 
 // Changes `projection` to that of a window on the wall.
@@ -118,7 +119,7 @@ extern "C" IceTImage icetDrawFrame(const IceTDouble* projection, const IceTDoubl
 {
     return guarded("icetDrawFrame", [&] {
         IceTContextStruct& context = currentContext();
-        return makeFrame(context, {projection, modelview, background}, {false, nullptr, Renderer(context)});
+        return makeFrame(context, {projection, modelview, background}, {nullptr, Renderer(context)});
     });
 }
 

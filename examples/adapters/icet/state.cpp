@@ -183,8 +183,7 @@ void set(const char* function, IceTEnum option, bool value)
 void choose(const char* function, IceTEnum Settings::*setting, IceTEnum value, const std::set<IceTEnum>& possible)
 {
     inContext(function, [&](IceTContextStruct& context) {
-        if (context.isDrawing)
-            throw Error(ICET_INVALID_OPERATION, "not while a frame is drawn");
+        requireNotDrawing(context);
         if (possible.count(value) == 0)
             throw Error(ICET_INVALID_ENUM, "there is no such value");
         context.settings.*setting = value;

@@ -20,6 +20,7 @@ std::array<int, 2> largestTile(const Settings& settings)
 
 int addTile(IceTContextStruct& context, const Tile& tile)
 {
+    requireNotDrawing(context);
     Settings& settings = context.settings;
     if (tile.viewport.empty())
         throw Error(ICET_INVALID_VALUE, "a tile without pixels");
@@ -66,6 +67,7 @@ NumberType numberType(IceTEnum type)
 extern "C" void icetResetTiles()
 {
     inContext("icetResetTiles", [](IceTContextStruct& context) {
+        requireNotDrawing(context);
         context.settings.tiles.clear();
         context.settings.physicalWidth = context.settings.physicalHeight = 0;
     });
@@ -83,6 +85,7 @@ extern "C" int icetAddTile(IceTInt x, IceTInt y, IceTSizeType width, IceTSizeTyp
 extern "C" void icetPhysicalRenderSize(IceTInt width, IceTInt height)
 {
     inContext("icetPhysicalRenderSize", [&](IceTContextStruct& context) {
+        requireNotDrawing(context);
         const auto [mostWide, mostHigh] = largestTile(context.settings);
         if (width < mostWide || height < mostHigh)
             raiseWarning("icetPhysicalRenderSize", ICET_INVALID_VALUE, "it is smaller than a tile");
