@@ -365,6 +365,9 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
             look.hi = file.range[1];
         }
     }
+    if (!(look.scale() > 0 && std::isfinite(look.scale())))
+        throw std::runtime_error(source.name + ": the range from " + textOf(look.lo) + " to " + textOf(look.hi)
+                                 + " is too small or too large to tell values apart");
     look.isovalues = choice.isovalues;
     look.isoOpacity = choice.opacity;
     for (const float value : look.isovalues) {

@@ -38,8 +38,8 @@ TEST_CASE("All ranks have the same notes for the user", "[scene]")
                       atoms = folder.write("atoms.xyz", "2\n\nXx 0 0 0\nXx 9 9 9\n");
     const Options both = optionsFor({blank, atoms});
     for (const int ranks : {1, 3})
-        for (const Notes& notes : test::ofRanks<Notes>(
-                 ranks, [&](const Loaders& loaders) { return loadRankScene(both, loaders).notes; })) {
+        for (const Notes& notes :
+             test::ofRanks<Notes>(ranks, [&](const Loaders& loaders) { return loadRankScene(both, loaders).notes; })) {
             REQUIRE(notes.size() == 2);
             CHECK(test::contains(notes[0], "blank_4x4x4_uint8.raw: there is nothing to see"));
             CHECK(test::contains(notes[1], "Xx (2)"));
@@ -55,8 +55,9 @@ TEST_CASE("Coordinates far from 0 are noted where float32 rounds them visibly", 
                       atoms = folder.write("far.xyz", "2\n\nC 0 0 -5000000\nC 9 9 -5000000\n"),
                       fine = folder.write("fine.obj", "v 50000 0 0\nv 50200 0 0\nv 50000 200 0\nf 1 2 3\n");
     for (const int ranks : {1, 3})
-        for (const Notes& notes : test::ofRanks<Notes>(
-                 ranks, [&](const Loaders& loaders) { return loadRankScene(optionsFor({mesh, atoms}), loaders).notes; })) {
+        for (const Notes& notes : test::ofRanks<Notes>(ranks, [&](const Loaders& loaders) {
+                 return loadRankScene(optionsFor({mesh, atoms}), loaders).notes;
+             })) {
             REQUIRE(notes.size() == 2);
             CHECK(test::contains(notes[0], "far.obj: its coordinates, from 5e+06,0,0 to "));
             CHECK(test::contains(notes[0], " to steps of 0.5"));
@@ -83,6 +84,20 @@ TEST_CASE("Path tracing says that it leaves volumes out", "[scene]")
     CHECK(test::contains(notesOf({volume, mesh, "--path", "2"})[0], "--path leaves volumes out"));
     CHECK(notesOf({mesh, "--path", "2"}).empty());
     CHECK(notesOf({volume}).empty());
+}
+
+TEST_CASE("A range that a float cannot divide by is named", "[scene]")
+{
+    const test::TemporaryFolder folder;
+    const std::string volume = folder.write("v_4x4x4_uint8.raw", std::string(64, 'v')),
+                      transfer = folder.write("t.json", R"({"points": [{"value": 0, "opacity": 0, "color": [0, 0, 0]},
+                          {"value": 1e-45, "opacity": 1, "color": [1, 1, 1]}]})");
+    for (const std::string& look : {std::string("range=0,1e-45"), std::string("range=-3e38,3e38"),
+                                    "transfer=" + transfer, std::string("range=0,1e-45:isovalue=0")})
+        for (const std::string& error : test::ofRanks<std::string>(2, [&](const Loaders& loaders) {
+                 return test::errorOf([&] { loadRankScene(optionsFor({volume + ':' + look}), loaders); });
+             }))
+            CHECK(test::isLineWith(error, "v_4x4x4_uint8.raw: the range from "));
 }
 
 TEST_CASE("The frame of an XYZ file is that of the option", "[scene]")
