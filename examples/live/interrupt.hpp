@@ -1,6 +1,7 @@
 // Interrupt: turns Ctrl-C, or the signal with which a launcher ends a job, into a flag that a loop can test.
 #pragma once
 
+#include <atomic>
 #include <csignal>
 #include <ctime>
 
@@ -25,7 +26,8 @@ public:
 
 private:
     // When the first signal came, in seconds of a clock that begins with 1; 0: none has come.
-    static inline volatile std::sig_atomic_t first_ = 0;
+    static inline std::atomic<std::sig_atomic_t> first_{0};
+    static_assert(decltype(first_)::is_always_lock_free, "a signal handler may not lock");
 
     static void note(int signal)
     {
