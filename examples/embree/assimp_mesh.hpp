@@ -82,7 +82,7 @@ inline void addNode(Mesh& mesh, const aiScene& scene, const aiNode& node, const 
 // not read. A .gltf is read with what it needs beside it. Throws std::runtime_error, one line that begins with `name`.
 inline Mesh parseWithAssimp(std::string_view bytes, const std::string& name, Notes* = nullptr)
 {
-    const std::string ending = name.substr(std::min(name.rfind('.'), name.size()));
+    const std::string ending = endingOf(name);
     Assimp::Importer importer;
     const aiScene* scene = ending == ".gltf"
                                ? importer.ReadFile(name, 0)

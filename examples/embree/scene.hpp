@@ -310,9 +310,7 @@ private:
     static void takeCorners(const Box& part, const FileToWorld& place, const Take& take)
     {
         for (int i = 0; i < 8 && !part.empty(); ++i)
-            take(place.toWorld(
-                     {i & 1 ? part.hi.x : part.lo.x, i & 2 ? part.hi.y : part.lo.y, i & 4 ? part.hi.z : part.lo.z}),
-                 0);
+            take(place.toWorld(part.corner(i)), 0);
     }
 
     // `forEach` calls its argument with the centre and radius of each sphere around an object, on each rank for the

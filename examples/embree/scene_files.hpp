@@ -79,7 +79,7 @@ inline void addFile(Scene& scene, const SceneFile& file, bool fit, int xyzFrame 
                     const VoxelGrid& grid = {}, const LookOf& lookOf = {})
 {
     const std::string& path = file.path;
-    const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
+    const std::string ending = endingOf(path);
     Notes notes;
     if (isHdf5(path))
         scene.add(openHdf5(path, loaders, grid, lookOf), fit, file.look);

@@ -310,7 +310,7 @@ inline std::array<float, 2> rangeOf(const VolumeSource& source, const Loaders& l
 // Reads the name or the header of a file. `grid` takes the place of its spacing and origin. Throws std::runtime_error.
 inline VolumeFile volumeFileOf(const std::string& path, const VoxelGrid& grid = {})
 {
-    const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
+    const std::string ending = endingOf(path);
     std::ifstream header;
     if (ending != ".raw")
         header.open(path, std::ios::binary);
