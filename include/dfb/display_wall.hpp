@@ -68,11 +68,12 @@ public:
     }
 
     // Waits until all displays have frame number `frame`: that is the moment to show it on all of them. Collective.
-    // Call it once for each frame, after the frame has ended, in the order of the frames. All frames of a wall must be
-    // of one framebuffer. Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks:
-    // TimedOut if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have
-    // not sent all of it, because it failed or was partial; MalformedMessage if a part of it cannot be right. The
-    // displays then keep their picture. Throws TransportError if the connection fails, and InvalidArgument on a thread
+    // Call it once for each frame, after the frame has ended, in the order of the frames. A display's rank keeps parts
+    // of 16 frames at most, and drops the oldest if later ones come. All frames of a wall must be of one framebuffer.
+    // Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks: TimedOut if a display
+    // has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have not sent all of it,
+    // because it failed or was partial, or if a display has dropped it; MalformedMessage if a part of it cannot be
+    // right. The displays then keep their picture. Throws TransportError if the connection fails, and InvalidArgument on a thread
     // that may not call MPI, or for a frame that is not later than the last.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 

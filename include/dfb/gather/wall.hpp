@@ -421,6 +421,12 @@ private:
         info.frame = frame;
         if (!error_.empty())
             return info;
+        if (frame <= dropped_) {
+            info.kind = ErrorKind::MissingInput;
+            info.message = printed("rank %d has dropped it, as parts of more than %zu frames came before finish()",
+                                   mailbox_->rank(), framesKept);
+            return info;
+        }
         info.kind = ErrorKind::TimedOut;
         for (const auto& [display, image] : shown_)
             if (const std::int64_t left = pixelsLeft(frame, display); left > 0) {

@@ -1,8 +1,11 @@
 // DisplayWall: which pixels travel to which rank. 4 ranks, which are threads.
 #include "board.hpp"
 #include "catch.hpp"
+#include "random_scene.hpp"
 
 #include <map>
+#include <string>
+#include <vector>
 
 namespace wall_cases {
 
@@ -40,6 +43,29 @@ TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
         INFO("rank " << rank);
         CHECK(bytes <= 4 * (4096 + 64));
     }
+}
+
+TEST_CASE("A wall that is not finished for many frames drops the oldest, and says so", "[wall]")
+{
+    const dfb::WallLayout layout{1, 1, 32, 32, 0, 0, {1}};
+    std::vector<std::string> dropped(2), kept(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        auto connection = dfb::connect<dfb::InprocTransport>(communicator);
+        dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8);
+        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::ToWall, dfb::InprocTransport> fb(
+            connection, wall.frameBufferConfig(), {&wall});
+        for (int frame = 1; frame <= 17; ++frame)
+            dfb::ImageParallelLoop(fb).render([](auto& tile) {
+                const float rgba[4] = {0.5f, 0, 0, 1};
+                tile.fill(rgba);
+            });
+        const auto me = static_cast<std::size_t>(fb.rank());
+        dropped[me] = scene::outcomeOf([&] { wall.finish(1); });
+        kept[me] = scene::outcomeOf([&] { wall.finish(2); });
+    });
+    for (const std::string& text : dropped)
+        CHECK(scene::has(text, "rank 1 has dropped it, as parts of more than 16 frames came before finish()"));
+    CHECK(kept == std::vector<std::string>(2, "fine"));
 }
 
 } // namespace wall_cases
