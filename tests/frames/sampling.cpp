@@ -178,6 +178,15 @@ struct Reset {
         const scene::Scene s = wholeScene(61, 47, 4);
         dfb::DistributedFrameBuffer<dfb::Progressive<dfb::BasicImageParallel<16>>, dfb::NoPixelOp, Transport> fb(
             communicator, configOf(s, 1));
+        // The first frame has nothing to go on with, whatever its accumulationId.
+        dfb::FrameConfig first = paramsOf(s);
+        for (const int id : {0, 1}) {
+            first.accumulationId = static_cast<std::uint64_t>(id);
+            first.samples = std::make_shared<const std::vector<dfb::TileSamples>>(
+                static_cast<std::size_t>(fb.layout().tileCount()), dfb::TileSamples{0, 0});
+            const std::string outcome = scene::outcomeOf([&] { fb.begin(first).end(); });
+            result.expect(scene::has(outcome, "begin again with sample 0"), "begins with nothing: " + outcome);
+        }
         dfb::AdaptiveSampler sampler(fb.layout(), {0, 2, 4, 2});
         dfb::ImageParallelLoop loop(fb);
         dfb::FrameReport report;

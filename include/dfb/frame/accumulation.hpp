@@ -7,6 +7,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <limits>
+#include <optional>
 
 DFB_NAMESPACE_BEGIN
 namespace detail {
@@ -64,8 +65,8 @@ public:
     }
 
 private:
-    std::uint64_t lastId_ = 0;
-    int next_ = 0; // the first sample of each tile, if the next frame has no plan and goes on
+    std::optional<std::uint64_t> lastId_; // null before the first frame that has ended without an error
+    int next_ = 0;                        // the first sample of each tile, if the next frame has no plan and goes on
 };
 
 } // namespace detail
