@@ -184,7 +184,7 @@ struct FrameSums {
     std::int64_t orderUndefinedPixels = 0; // of finished tiles, see TileReport
     std::int64_t compressedLinks = 0;      // pairs of sender and receiver for which compression paid
     // Messages with pixels that were dropped since the last verdict, because their frame had failed, or because an
-    // opaque input that came sooner hides them.
+    // opaque input that came sooner hides them. A failure after a rank's vote counts as well.
     std::int64_t lateMessages = 0;
     std::int64_t repeatedMessages = 0; // messages that came twice and were dropped, since the last verdict
 };
@@ -194,8 +194,8 @@ struct FrameSums {
 struct FrameReport : FrameSums {
     std::int64_t frame = 0;
     std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why tiles are missing, if any are
-    // All: tiles that were not finished. Finished tiles that have not reached the display rank count, too. Such tiles
-    // show the background.
+    // All: tiles that were not finished. On the display rank finished tiles that have not reached it count, too, and
+    // background tiles for which the pixel operation threw. Such tiles show the background.
     std::int64_t tilesIncomplete = 0;
     double totalMs = 0;               // begin() to the return of end(), this rank
     double renderMs = 0;              // begin() to the call of end(), this rank

@@ -245,8 +245,8 @@ public:
     // come with or without a checksum; see checkChecksum(). May be called any number of times.
     void setAlike() noexcept { isAlike_ = true; }
 
-    // How many messages came twice and were dropped, since the start.
-    std::int64_t duplicates() const noexcept { return duplicates_; }
+    // How many messages came twice and were dropped, since the last call.
+    std::int64_t takeDuplicates() noexcept { return duplicates_.exchange(0); }
 
     // A text that says which ranks have sent messages that did not arrive although later ones did. May be empty.
     std::string lost() const

@@ -109,6 +109,7 @@ public:
     void newEpoch(std::int64_t number)
     {
         sentOn_ = takenOn_ = 0;
+        bytesSent_ = messagesSent_ = 0;
         flow_.newEpoch();
         enterEpoch(number);
     }

@@ -59,10 +59,8 @@ struct Agreement {
                 add(name, value ? "true" : "false");
             else if constexpr (std::is_floating_point_v<Value>)
                 add(name, digitsOf(value));
-            else if constexpr (std::is_unsigned_v<Value>)
-                add(name, printed("%llu", static_cast<unsigned long long>(value)));
             else
-                add(name, printed("%lld", static_cast<long long>(value)));
+                add(name, std::to_string(value));
         }
         const std::string& text() const noexcept { return text_; }
 

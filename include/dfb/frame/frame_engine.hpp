@@ -118,22 +118,15 @@ public:
             hidden_.newFrame(layout().tileCount());
         outcome_->newFrame(FrameTerms::of(params, rank()), config_.quiet);
         inputsSent_ = 0;
-        bytesBefore_ = mailbox_->bytesSent();
-        messagesBefore_ = mailbox_->messagesSent();
         renderNs_ = -1;
         figures_.newFrame();
         std::int64_t rendered = 0;
-        std::vector<int> kept; // tiles without samples, which the pixel operation wants to see all the same
-        for (const int tile : ownedNow()) {
-            if (pipeline_->table().samples(tile).count > 0)
-                ++rendered;
-            else if (!traits().pixelOpIsPointwise)
-                kept.push_back(tile);
-        }
+        for (const int tile : ownedNow())
+            rendered += pipeline_->table().samples(tile).count > 0;
         lastPoll_ = beginTime_ = Clock::now();
         mailbox_->newEpoch(open_.next());
         mailbox_->connection().expectMessages(true);
-        open(userError, params.declared ? 0 : rendered, kept);
+        open(userError, rendered);
     }
 
     TileHeader headerOf(int tile, int pass) const override { return pipeline_->headerOf(tile, pass); }
@@ -143,7 +136,7 @@ public:
     {
         const TraceSpan span(config_.trace.get(), TraceEvent::Kind::SetTile, tile.frame, tile.tile);
         pipeline_->check(tile);
-        if (outcome_->failed() || isHidden(tile.tile, tile.generation))
+        if (!isOpen() || outcome_->failed() || isHidden(tile.tile, tile.generation))
             return;
         const int owner = ownerNow(tile.tile);
         const bool isInPlace = pipeline_->mayReadInPlace(tile);
@@ -341,9 +334,7 @@ public:
     {
         const EndOfFrame ending{*this};
         try {
-            if (outcome_->failed())
-                outcome_->dropRest(ErrorKind::Cancelled);
-            else
+            if (!outcome_->failed())
                 outcome_->failWhole(errorInfo(ErrorKind::Cancelled,
                                               "the frame was left without end(). If by an exception: Frame::guard() "
                                               "around what throws tells all ranks its text"));
@@ -424,23 +415,28 @@ private:
         add(TraceEvent::Kind::End, rendered, end);
     }
 
-    // Lets messages of the frame in. `tiles`: how many this rank expects to finish. `withoutSamples`: tiles without
-    // samples in this frame that the pixel operation still has to see.
-    void open(const std::exception_ptr& userError, std::int64_t tiles, const std::vector<int>& withoutSamples)
+    // Lets messages of the frame in. `rendered`: how many of this rank's tiles have samples.
+    void open(const std::exception_ptr& userError, std::int64_t rendered)
     {
+        // A pixel operation that is not pointwise wants to see tiles without samples, too.
+        const std::int64_t kept =
+            traits().pixelOpIsPointwise ? 0 : static_cast<std::int64_t>(ownedNow().size()) - rendered;
         auto& early = open_.open();
-        open_.expectTiles(tiles + static_cast<std::int64_t>(withoutSamples.size()));
+        open_.expectTiles(kept + (params_.declared ? 0 : rendered));
         if (userError) // end() throws it on all ranks; nothing is made with half of the frame's data
             outcome_->failWhole(errorInfoOf(userError, {}));
         for (Arrival& a : early)
             incoming(a.source, a.header, std::move(a.message));
         early.clear(); // if the frame has failed, some have not been taken
         failForDamage();
-        for (const int tile : withoutSamples)
-            if (const auto inside = open_.enter(open_.number()))
-                submitFinish(tile);
-        if (!params_.declared && open_.expectNoMore())
-            allFinished();
+        outcome_->guarded([&] {
+            const auto inside = open_.enter(open_.number());
+            for (const int tile : ownedNow())
+                if (kept > 0 && pipeline_->table().samples(tile).count == 0)
+                    submitFinish(tile);
+            if (!params_.declared && open_.expectNoMore())
+                allFinished();
+        });
     }
 
     // ---- messages
@@ -714,14 +710,13 @@ private:
             v.error->frame = open_.number();
             v.error->tile = tile;
         }
-        const std::int64_t repeated = mailbox_->connection().duplicates();
         const auto reports = pipeline_->reports();
-        v.sums.bytesSent = mailbox_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes();
-        v.sums.messagesSent = mailbox_->messagesSent() - messagesBefore_;
+        v.sums.bytesSent = mailbox_->bytesSent() + pipeline_->gather().placedBytes();
+        v.sums.messagesSent = mailbox_->messagesSent();
         v.sums.tilesTouched = open_.areTilesFinished() ? pipeline_->table().touchedCount() : 0;
         v.sums.nonFinitePixels = pipeline_->faults().nonFinite;
         v.sums.lateMessages = open_.takeLateCount();
-        v.sums.repeatedMessages = repeated - repeatedBefore_;
+        v.sums.repeatedMessages = mailbox_->connection().takeDuplicates();
         v.sums.orderUndefinedPixels = reports.orderUndefinedPixels;
         v.sums.alphaOutsidePixels = pipeline_->faults().alphaOutside;
         v.sums.compressedLinks = compression_.links();
@@ -734,7 +729,6 @@ private:
         v.wireErrorBound = reports.wireErrorBound;
         v.tileErrors = FrameFigures::sums(reports.errors);
         figures_.addTo(v);
-        repeatedBefore_ = repeated;
     }
 
     void polled() override
@@ -786,7 +780,6 @@ private:
     Compression compression_;
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
     std::atomic<std::int64_t> renderNs_{-1};  // from begin() until end(); -1: not there yet
-    std::int64_t bytesBefore_ = 0, messagesBefore_ = 0, repeatedBefore_ = 0;
     Clock::time_point beginTime_;
     std::atomic<Clock::time_point> lastPoll_{}; // by pollNowAndThen()
 

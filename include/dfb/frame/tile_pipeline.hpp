@@ -389,7 +389,6 @@ private:
         pixels.aux = auxOf(planes);
         operations_.process(pixels);
         auto place = gather_.reserve(tile);
-        table_.backgroundPixels(tile).newFrame(region.width(), region.height(), 0);
         FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither);
         for (int y = 0; y < region.height(); ++y) {
             const Planes row = planes.from(width * static_cast<std::size_t>(y));

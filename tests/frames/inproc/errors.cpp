@@ -1132,6 +1132,29 @@ TEST_CASE("Cancelling or aborting a frame that is over changes nothing", "[error
     CHECK(texts == std::vector<std::string>(2, "fine"));
 }
 
+TEST_CASE("Tiles of a frame that is over are dropped before they are sent", "[errors]")
+{
+    auto config = configOf(scene::makeScene(3));
+    config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<Blend> fb(communicator, config);
+        dfb::FrameConfig params;
+        params.declared = true;
+        params.timeout = std::chrono::seconds(5); // otherwise setTile() might wait for room for ever
+        auto first = fb.begin(params);
+        first.declare({});
+        auto tile = std::make_unique<typename FrameBuffer<Blend>::Tile>();
+        first.start(*tile, 0);
+        tile->generation = 1;
+        first.end();
+        for (int i = 0; i < 3; ++i)
+            first.setTile(*tile);
+        auto second = fb.begin(params);
+        second.declare({});
+        CHECK(second.end().lateMessages == 0);
+    });
+}
+
 TEST_CASE("A frame that has ended or was moved from cannot be ended", "[errors]")
 {
     dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
