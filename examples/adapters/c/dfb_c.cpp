@@ -276,22 +276,6 @@ void store(const Struct& from, Struct* to, std::size_t structSize)
         std::memcpy(to, &from, std::min(sizeof from, structSize));
 }
 
-int create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer** framebuffer)
-{
-    // They end after an exception that all ranks get, in order.
-    std::shared_ptr<dfb::Connection> connection;
-    std::unique_ptr<dfb_framebuffer> made;
-    const int status = guarded([&] {
-        if (communicator == MPI_COMM_NULL)
-            refuse("the communicator is MPI_COMM_NULL");
-        connection = dfb::connect(communicator);
-        made = std::make_unique<dfb_framebuffer>(connection, config, framebuffer != nullptr);
-    });
-    if (framebuffer)
-        *framebuffer = made.release();
-    return status;
-}
-
 } // namespace
 
 extern "C" {
@@ -310,14 +294,25 @@ void dfb_config_init_sized(dfb_config* config, size_t struct_size, int width, in
 
 int dfb_create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer** framebuffer)
 {
-    return create(communicator, config, framebuffer);
+    // They end after an exception that all ranks get, in order.
+    std::shared_ptr<dfb::Connection> connection;
+    std::unique_ptr<dfb_framebuffer> made;
+    const int status = guarded([&] {
+        if (communicator == MPI_COMM_NULL)
+            refuse("the communicator is MPI_COMM_NULL");
+        connection = dfb::connect(communicator);
+        made = std::make_unique<dfb_framebuffer>(connection, config, framebuffer != nullptr);
+    });
+    if (framebuffer)
+        *framebuffer = made.release();
+    return status;
 }
 
 int dfb_create_fortran(MPI_Fint communicator, const dfb_config* config, dfb_framebuffer** framebuffer)
 {
-    int isInitialized = 0; // if it is 0, the handle cannot be converted; create() then reports that
+    int isInitialized = 0; // if it is 0, the handle cannot be converted; dfb_create() then reports that
     MPI_Initialized(&isInitialized);
-    return create(isInitialized ? MPI_Comm_f2c(communicator) : MPI_COMM_WORLD, config, framebuffer);
+    return dfb_create(isInitialized ? MPI_Comm_f2c(communicator) : MPI_COMM_WORLD, config, framebuffer);
 }
 
 void dfb_destroy(dfb_framebuffer* framebuffer) { delete framebuffer; }
