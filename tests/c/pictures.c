@@ -370,6 +370,25 @@ static void check_composite(dfb_framebuffer* fb)
     expect(dfb_composite(NULL, &nothing, 0) == DFB_INVALID_ARGUMENT, "no framebuffer");
 }
 
+/* A size that cannot be changes nothing, whether the picture is of images or of bricks. */
+static void check_sizes(dfb_framebuffer* fb)
+{
+    for (int has_bricks = 0; has_bricks < 2; ++has_bricks)
+        for (int on_all_ranks = 0; on_all_ranks < 2; ++on_all_ranks) {
+            if (has_bricks)
+                render(fb);
+            else
+                composite_bytes(fb);
+            if (on_all_ranks)
+                require(dfb_image_on_all_ranks(fb), "dfb_image_on_all_ranks");
+            const uint8_t* shown = dfb_image_rgba8(fb);
+            expect((shown != NULL) == (on_all_ranks || dfb_is_display_rank(fb)), "a picture before an error");
+            expect_error(dfb_resize(fb, rank == 0 ? 0 : 20, 20), DFB_INVALID_ARGUMENT, "0x20", "rank 0", "dfb_resize");
+            expect(dfb_width(fb) == scene_width, "the size after an error");
+            expect(dfb_image_rgba8(fb) == shown, "the picture after dfb_resize() that was refused");
+        }
+}
+
 static void check_errors(void)
 {
     expect(dfb_version() && strchr(dfb_version(), '.'), "the version");
@@ -382,9 +401,7 @@ static void check_errors(void)
     expect(dfb_get_report(fb, NULL) == DFB_INVALID_ARGUMENT, "a null report");
     check_render(fb);
     check_composite(fb);
-    /* A size that cannot be changes nothing. */
-    expect_error(dfb_resize(fb, rank == 0 ? 0 : 20, 20), DFB_INVALID_ARGUMENT, "0x20", "rank 0", "dfb_resize");
-    expect(dfb_width(fb) == scene_width, "the size after an error");
+    check_sizes(fb);
     composite_bytes(fb);
     for (int has_bricks = 0; has_bricks < 2 && ranks > 1; ++has_bricks) {
         if (has_bricks)

@@ -321,10 +321,10 @@ int dfb_resize(dfb_framebuffer* framebuffer, int width, int height)
 {
     return inFramebuffer(framebuffer, [&](dfb_framebuffer& fb) {
         if (fb.showsBricks) // another rank may have called dfb_image_on_all_ranks() on it
-            std::visit([&](auto& bricks) { bricks.resize(width, height); }, *fb.bricks);
+            std::visit([](auto& bricks) { bricks.allGather({}, "resize()"); }, *fb.bricks);
+        fb.images->resize(width, height); // if this throws, nothing has changed
         newPicture(fb, false);
         fb.bricks.reset(); // is made anew when it is needed
-        fb.images->resize(width, height);
         fb.frameBufferConfig.image.width = width;
         fb.frameBufferConfig.image.height = height;
     });
