@@ -11,6 +11,7 @@
 
 #include <dfb.h>
 
+#include <pthread.h>
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -389,6 +390,56 @@ static void check_sizes(dfb_framebuffer* fb)
         }
 }
 
+struct call {
+    dfb_framebuffer* fb;
+    int which, status;
+};
+
+static void* call_from_thread(void* argument)
+{
+    struct call* call = argument;
+    dfb_input input;
+    dfb_brick bricks[2];
+    get_bricks(bricks);
+    dfb_input_init(&input);
+    if (call->which == 0)
+        call->status = dfb_composite(call->fb, &input, 0);
+    if (call->which == 1)
+        call->status = dfb_render(call->fb, bricks, 2, scene_view, scene_projection, draw, NULL);
+    if (call->which == 2)
+        call->status = dfb_resize(call->fb, 20, 20);
+    return NULL;
+}
+
+/* Below MPI_THREAD_SERIALIZED calls of another thread are refused, and change nothing. */
+static void check_other_thread(dfb_framebuffer* fb)
+{
+    int level = MPI_THREAD_MULTIPLE;
+    MPI_Query_thread(&level);
+    for (int which = 0; which < 3 && level < MPI_THREAD_SERIALIZED; ++which)
+        for (int has_bricks = 0; has_bricks < 2; ++has_bricks)
+            for (int on_all_ranks = 0; on_all_ranks < 2; ++on_all_ranks) {
+                /* One picture, then the other: the refused call must not bring the first one back. */
+                if (has_bricks)
+                    composite_bytes(fb);
+                render(fb);
+                if (!has_bricks)
+                    composite_bytes(fb);
+                if (on_all_ranks)
+                    require(dfb_image_on_all_ranks(fb), "dfb_image_on_all_ranks");
+                const uint8_t* shown = dfb_image_rgba8(fb);
+                struct call call = {fb, which, DFB_OK};
+                pthread_t thread;
+                expect(pthread_create(&thread, NULL, call_from_thread, &call) == 0, "a thread");
+                pthread_join(thread, NULL);
+                char what[80];
+                snprintf(what, sizeof what, "call %d of another thread, with bricks: %d, on all ranks: %d", which,
+                         has_bricks, on_all_ranks);
+                expect(call.status == DFB_INVALID_ARGUMENT, what);
+                expect(dfb_image_rgba8(fb) == shown, what);
+            }
+}
+
 static void check_errors(void)
 {
     expect(dfb_version() && strchr(dfb_version(), '.'), "the version");
@@ -402,6 +453,7 @@ static void check_errors(void)
     check_render(fb);
     check_composite(fb);
     check_sizes(fb);
+    check_other_thread(fb);
     composite_bytes(fb);
     for (int has_bricks = 0; has_bricks < 2 && ranks > 1; ++has_bricks) {
         if (has_bricks)

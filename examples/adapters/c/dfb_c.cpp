@@ -254,10 +254,20 @@ int inFramebuffer(dfb_framebuffer* framebuffer, const Body& body) noexcept
     });
 }
 
-void newPicture(dfb_framebuffer& fb, bool showsBricks)
+// Makes a picture with make(), which returns its report. If that throws InvalidArgument, the picture was not begun, and
+// the last one is still shown.
+template <class Make>
+void makePicture(dfb_framebuffer& fb, bool showsBricks, const Make& make)
 {
-    fb.everywhere = {};
-    fb.showsBricks = showsBricks;
+    const bool showedBricks = std::exchange(fb.showsBricks, showsBricks);
+    dfb::Image copy = std::exchange(fb.everywhere, {});
+    try {
+        fb.report = make();
+    } catch (const dfb::InvalidArgument&) {
+        fb.showsBricks = showedBricks;
+        fb.everywhere = std::move(copy);
+        throw;
+    }
 }
 
 // The picture, for the functions that return its colour or depth; null if there is none.
@@ -323,7 +333,8 @@ int dfb_resize(dfb_framebuffer* framebuffer, int width, int height)
         if (fb.showsBricks) // another rank may have called dfb_image_on_all_ranks() on it
             std::visit([](auto& bricks) { bricks.allGather({}, "resize()"); }, *fb.bricks);
         fb.images->resize(width, height); // if this throws, nothing has changed
-        newPicture(fb, false);
+        fb.everywhere = {};
+        fb.showsBricks = false;
         fb.bricks.reset(); // is made anew when it is needed
         fb.frameBufferConfig.image.width = width;
         fb.frameBufferConfig.image.height = height;
@@ -361,7 +372,6 @@ void dfb_input_init_sized(dfb_input* input, size_t struct_size)
 int dfb_composite(dfb_framebuffer* framebuffer, const dfb_input* input, int place)
 {
     return inFramebuffer(framebuffer, [&](dfb_framebuffer& fb) {
-        newPicture(fb, false);
         dfb::InputImage image;
         std::exception_ptr wrong;
         try {
@@ -369,9 +379,12 @@ int dfb_composite(dfb_framebuffer* framebuffer, const dfb_input* input, int plac
         } catch (...) {
             wrong = std::current_exception();
         }
-        if (wrong)
+        makePicture(fb, false, [&] {
+            if (!wrong)
+                return fb.images->composite(image, place, fb.frame);
             fb.images->startFailed(wrong, fb.frame);
-        fb.report = wrong ? fb.images->end() : fb.images->composite(image, place, fb.frame);
+            return fb.images->end();
+        });
     });
 }
 
@@ -385,7 +398,6 @@ int dfb_render(dfb_framebuffer* framebuffer, const dfb_brick* bricks, int count,
             fb.bricks.emplace(std::in_place_index<1>, fb.connection, fb.frameBufferConfig);
         else if (!fb.bricks)
             fb.bricks.emplace(std::in_place_index<0>, fb.connection, fb.frameBufferConfig);
-        newPicture(fb, true);
         std::optional<Scene> scene;
         std::optional<dfb::MatrixCamera> camera;
         std::exception_ptr wrong;
@@ -395,7 +407,7 @@ int dfb_render(dfb_framebuffer* framebuffer, const dfb_brick* bricks, int count,
         } catch (...) {
             wrong = std::current_exception();
         }
-        const auto makePicture = [&](auto& bricksOfAll) {
+        const auto render = [&](auto& bricksOfAll) {
             if (!wrong)
                 return dfb::DataParallelLoop(bricksOfAll, scene->world)
                     .render(
@@ -408,7 +420,7 @@ int dfb_render(dfb_framebuffer* framebuffer, const dfb_brick* bricks, int count,
             open.abort(wrong);
             return open.end();
         };
-        fb.report = std::visit(makePicture, *fb.bricks);
+        makePicture(fb, true, [&] { return std::visit(render, *fb.bricks); });
     });
 }
 
