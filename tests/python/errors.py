@@ -254,6 +254,18 @@ class Errors(unittest.TestCase):
                 errors = errors_of(compositor, lambda thing, rank: thing.resize(*(size if rank == 1 else (20, 10))), again)
                 self.assertEqual({(e.kind, e.rank, str(e)) for e in errors}, {("InvalidArgument", 1, str(errors[0]))})
                 self.assertIn(text, str(errors[0]))
+                of_framebuffer = errors_of(framebuffer, lambda thing, rank: thing.resize(*(size if rank == 1 else (20, 10))),
+                                           lambda thing, rank: thing.resize(20, 10))
+                self.assertEqual({str(e) for e in of_framebuffer}, {str(errors[0])})
+
+    def test_all_hear_why_before_a_rank_leaves(self):
+        def refused(comm):
+            with compositor(comm) as thing:
+                thing.resize("wide" if comm.rank == 1 else 20, 10)
+
+        for _ in range(20):  # now this one, now that one leaves first
+            errors = dfb.run_ranks(RANKS, lambda comm: error_of(lambda: refused(comm)))
+            self.assertEqual({(e.kind, e.rank) for e in errors}, {("InvalidArgument", 1)})
 
     def test_a_rank_leaves(self):
         """run_ranks() raises the exception of a rank, also if others have come to their end first, as they heard of it."""

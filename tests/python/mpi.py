@@ -84,6 +84,24 @@ def errors():
     return image  # which lives longer than MPI
 
 
+def owners():
+    """Between nodes, tiles belong to ranks near their pixels once a picture has shown where these are."""
+    import resource
+    # Ranks that share no memory count as nodes of their own, and they share none if files must be shorter than 4 GiB.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**30, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    images = [np.random.default_rng(r).integers(0, 256, (256, 128, 4)).astype(np.uint8) for r in range(SIZE)]
+    with dfb.ImageCompositor(comm, 128 * SIZE, 256, "order") as compositor:
+        def bytes_of_picture():
+            return compositor.composite(images[RANK], order=RANK, origin=(128 * RANK, 0)).bytes_sent
+
+        for width in (128 * SIZE, 128 * SIZE + 64):
+            compositor.resize(width, 256)
+            first, second = bytes_of_picture(), bytes_of_picture()
+            assert SIZE == 1 or second < 0.8 * first, (first, second)
+            if RANK == 0:
+                assert_exact(compositor.image[:, :128 * SIZE], np.concatenate(images, axis=1) / 255)
+
+
 def left_open():
     """Objects that nobody closes end with the program."""
     compositor = dfb.ImageCompositor(comm, WIDTH, HEIGHT)

@@ -50,7 +50,7 @@ for test in compositor errors framebuffer memory package; do
     in_root timeout 200 python3 -B "/dfb/tests/python/$test.py" || failed "$test.py"
 done
 for count in 1 2 3 5; do
-    for case in pictures frames errors left_open; do
+    for case in pictures frames errors owners left_open; do
         python $count -m mpi4py /dfb/tests/python/mpi.py $case >"$said" 2>&1 || failed "$case on $count ranks"
         if [ "$(grep -c ': done' "$said")" != $count ]; then
             cat "$said"

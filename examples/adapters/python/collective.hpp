@@ -12,7 +12,9 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include <algorithm>
 #include <array>
+#include <cstddef>
 #include <memory>
 #include <optional>
 #include <string>
@@ -27,8 +29,7 @@ class Collective {
 public:
     // `make(connection)` returns the object. Collective.
     template <class Make>
-    Collective(const py::object& comm, const Settings& settings, const Make& make)
-        : frame_(settings.frame), veto_(settings.veto)
+    Collective(const py::object& comm, const Settings& settings, const Make& make) : frame_(settings.frame)
     {
         auto connection = connect(comm);
         views_.emplace(connection->pool());
@@ -61,21 +62,23 @@ public:
         const Use use(*this);
         const bool hasArrays = views_->any();
         py::detail::make_caster<std::array<int, 2>> size;
-        std::array<int, 2> to{1, 1}; // not used if there is a veto: then all ranks refuse
+        std::array<int, 2> to{};
+        std::string why; // this rank refuses
         if (hasArrays)
-            veto_.set("there are arrays of the image, so it cannot get another size: delete them, or take copies");
+            why = "there are arrays of the image, so it cannot get another size: delete them, or take copies";
         else if (size.load(py::make_tuple(width, height), true))
             to = py::detail::cast_op<std::array<int, 2>>(size);
         else
-            veto_.set("the new size is " + shown(width) + " x " + shown(height) + ": it must be two ints");
-        const std::string vetoed = veto_.text();
+            why = "the new size is " + shown(width) + " x " + shown(height) + ": it must be two ints";
         try {
-            withoutGil(*Cause::make(), [&] { object_->resize(to[0], to[1]); });
+            withoutGil(*Cause::make(), [&] {
+                refuseTogether(why, "resize()");
+                object_->resize(to[0], to[1]);
+            });
         } catch (py::error_already_set& error) {
-            veto_.clear();
             if (!hasArrays)
                 throw;
-            py::raise_from(error, PyExc_BufferError, vetoed.c_str());
+            py::raise_from(error, PyExc_BufferError, why.c_str());
             throw py::error_already_set();
         }
     }
@@ -138,8 +141,27 @@ protected:
     const dfb::FrameConfig& frame() const noexcept { return frame_; }
 
 private:
+    // Collective. Throws InvalidArgument on all ranks, with the reason of the lowest rank that has one, if `why` is not
+    // empty everywhere. `call`: see dfb::ImageCompositor::allGather().
+    void refuseTogether(const std::string& why, const char* call)
+    {
+        const auto* bytes = reinterpret_cast<const std::byte*>(why.data());
+        const auto reasons = object_->allGather({bytes, bytes + why.size()}, call);
+        const auto first = std::find_if(reasons.begin(), reasons.end(), [](const auto& r) { return !r.empty(); });
+        if (first == reasons.end())
+            return;
+        try {
+            object_->allGather({}, call); // no rank may leave before all know the reason
+        } catch (const dfb::TransportError&) {
+            // A rank has left already, so all know it.
+        }
+        dfb::ErrorInfo info;
+        info.rank = static_cast<int>(first - reasons.begin());
+        info.message.assign(reinterpret_cast<const char*>(first->data()), first->size());
+        throw dfb::InvalidArgument(std::move(info));
+    }
+
     dfb::FrameConfig frame_;
-    Veto veto_;
     std::unique_ptr<Object> object_;
     std::optional<ImageViews> views_;
     bool isInUse_ = false;

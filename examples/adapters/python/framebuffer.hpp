@@ -12,6 +12,7 @@
 #include <dfb/render/world.hpp>
 
 #include <array>
+#include <cstddef>
 #include <exception>
 #include <functional>
 #include <memory>
@@ -44,6 +45,7 @@ public:
     virtual const dfb::FrameBufferConfig& config() const = 0;
     virtual const dfb::Image& image() const = 0;
     virtual dfb::Image imageOnAllRanks() = 0;
+    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call) = 0;
     virtual void resize(int width, int height) = 0;
     // Renders a whole frame. `data` is for a NumpyOperation.
     virtual dfb::FrameReport render(const dfb::World& world, const AnyCamera& camera, const RenderBrick& draw,
@@ -70,6 +72,10 @@ public:
     const dfb::FrameBufferConfig& config() const override { return inner_.config(); }
     const dfb::Image& image() const override { return inner_.image(); }
     dfb::Image imageOnAllRanks() override { return inner_.imageOnAllRanks(); }
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call) override
+    {
+        return inner_.allGather(bytes, call);
+    }
     void resize(int width, int height) override { inner_.resize(width, height); }
 
     dfb::FrameReport render(const dfb::World& world, const AnyCamera& camera, const RenderBrick& draw,

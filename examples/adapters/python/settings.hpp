@@ -13,33 +13,15 @@
 #include <array>
 #include <chrono>
 #include <cmath>
+#include <cstdint>
+#include <exception>
 #include <memory>
+#include <stdexcept>
 #include <string>
 #include <type_traits>
 #include <utility>
 
 namespace dfb_python {
-
-// A reason of this rank against the next collective construction or resize(), which then throws on all ranks with this
-// text. Both call the owner map; it throws the reason, and the library tells all ranks.
-class Veto {
-public:
-    dfb::OwnerMap ownerMap() const
-    {
-        return [why = why_](int tile, const dfb::TileLayout& layout, int rankCount) {
-            if (!why->empty())
-                throw std::runtime_error(*why);
-            return dfb::latticeOwner(tile, layout, rankCount);
-        };
-    }
-    void set(std::string why) { *why_ = std::move(why); }
-    void clear() { why_->clear(); }
-    bool isSet() const noexcept { return !why_->empty(); }
-    const std::string& text() const noexcept { return *why_; }
-
-private:
-    std::shared_ptr<std::string> why_ = std::make_shared<std::string>();
-};
 
 // Returns an argument as text for an error.
 inline std::string shown(const py::handle& value) { return py::repr(value); }
@@ -70,20 +52,19 @@ inline dfb::OutputFormat outputOf(const std::string& name)
 struct Settings {
     dfb::FrameBufferConfig config;
     dfb::FrameConfig frame;
-    Veto veto;
 
-    // With the GIL. Throws nothing: if arguments are wrong, the reason becomes a veto.
+    // With the GIL. Throws nothing: if arguments are wrong, the collective construction with `config` does so, on all
+    // ranks.
     explicit Settings(const py::dict& from)
     {
-        config.image.ownerMap = veto.ownerMap();
         attempt([&] { read(from); });
     }
 
-    // Calls body(), with the GIL, and makes its exception a veto.
+    // Calls body(), with the GIL, unless arguments are wrong already. They are wrong if it throws.
     template <class Body>
     void attempt(const Body& body)
     {
-        if (veto.isSet())
+        if (isRefused_)
             return;
         const auto cause = Cause::make();
         try {
@@ -99,9 +80,11 @@ struct Settings {
 private:
     void refuse(const std::string& why)
     {
-        config = dfb::FrameBufferConfig(1, 1); // this is valid, so all ranks get the veto
-        config.image.ownerMap = veto.ownerMap();
-        veto.set(why);
+        // If an owner map throws on one rank, the library reports this on all ranks. There is none otherwise, so that
+        // the library may choose owners near the pixels.
+        config = dfb::FrameBufferConfig(1, 1);
+        config.image.ownerMap = [why](int, const dfb::TileLayout&, int) -> int { throw std::invalid_argument(why); };
+        isRefused_ = true;
     }
 
     void read(const py::dict& from)
@@ -126,6 +109,8 @@ private:
             frame.timeout = std::chrono::milliseconds(static_cast<std::int64_t>(std::ceil(1000 * seconds)));
         }
     }
+
+    bool isRefused_ = false;
 };
 
 } // namespace dfb_python
