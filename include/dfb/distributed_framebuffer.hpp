@@ -382,14 +382,20 @@ public:
 
     // Begins a frame. Every rank must call it, with an equal `params`. All ranks must call begin() and end() in the
     // same order: setTile() may wait for room at a rank, and there is none before that rank has begun the frame. Copies
-    // `tileData` and `pixelData`. Waits for no other rank. Throws InvalidArgument, with nothing sent, if the frame that
-    // was begun config.framesInFlight frames ago is still open, if a field of `params` is out of range, or on a thread
-    // that may not call MPI (see Progress). Throws TransportError if the connection has failed.
+    // `tileData` and `pixelData`. `failure`: an exception that was thrown while `params` were made, if any; end() then
+    // throws a FrameError with its text on all ranks, as after Frame::abort(). Waits for no other rank. Throws
+    // InvalidArgument, with nothing sent, if the frame that was begun config.framesInFlight frames ago is still open,
+    // if a field of `params` is out of range, or on a thread that may not call MPI (see Progress). Throws
+    // TransportError if the connection has failed.
     Frame begin(const FrameConfig& params = {}, const TileFrameData& tileData = {},
-                const PixelFrameData& pixelData = {})
+                const PixelFrameData& pixelData = {}, const std::exception_ptr& failure = nullptr)
     {
         Engine& engine = *engines_[next_];
-        engine.begin(params, [&] { operations_[next_]->newFrame(tileData, pixelData); });
+        engine.begin(params, [&] {
+            if (failure)
+                std::rethrow_exception(failure);
+            operations_[next_]->newFrame(tileData, pixelData);
+        });
         next_ = (next_ + 1) % engines_.size();
         return Frame(this, &engine);
     }

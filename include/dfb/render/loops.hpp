@@ -190,7 +190,7 @@ private:
 namespace detail {
 
 // Finds the order and the owners of a loop's frames from a SharedWorld and a camera. begin() needs them, but an
-// exception of the camera has to come out of the frame, on all ranks: so set() keeps it, and rethrow() throws it.
+// exception of the camera has to come out of the frame, on all ranks: so set() keeps it for begin().
 class FromWorld {
 public:
     // `isOrdered`: inputs come in an order that the loop was given, without depth.
@@ -208,12 +208,9 @@ public:
         }
     }
 
-    // Call it within the frame: throws what the camera threw in set().
-    void rethrow() const
-    {
-        if (failure_)
-            std::rethrow_exception(failure_);
-    }
+    // What the camera threw in set(), or null. begin() has to get it, as inputs of other ranks may be here already:
+    // without the order, they are not what this rank expects.
+    const std::exception_ptr& failure() const noexcept { return failure_; }
 
 private:
     // Sets config.owners, where ranks are on several nodes, unless it is set or the framebuffer has an owner map.
@@ -248,10 +245,9 @@ public:
     // Calls job(brick, tile) for each brick, tile and pass, with a tile that has been started for them.
     template <class Render, class FrameBuffer, class Camera, class Job>
     void forEach(FrameBuffer& fb, typename FrameBuffer::Frame& frame, const World& world, const Camera& camera,
-                 const Job& job, const FromWorld& fromWorld = FromWorld())
+                 const Job& job)
     {
         frame.guard([&] {
-            fromWorld.rethrow();
             pairs_ = visibleTiles(world, camera, fb.layout(), std::move(pairs_));
             inputs_ = inputsOf(world, pairs_, std::move(inputs_));
             frame.declare(inputs_);
@@ -306,14 +302,11 @@ public:
         params.declared = true;
         if (all_)
             fromWorld_.set(params, fb_, *all_, camera);
-        auto frame = fb_.begin(params, tileData, pixelData);
-        bricks_.template forEach<RenderBrick>(
-            fb_, frame, world_, camera,
-            [&](const Brick& brick, auto& tile) {
-                renderBrick(brick, tile);
-                frame.setTile(tile);
-            },
-            fromWorld_);
+        auto frame = fb_.begin(params, tileData, pixelData, fromWorld_.failure());
+        bricks_.template forEach<RenderBrick>(fb_, frame, world_, camera, [&](const Brick& brick, auto& tile) {
+            renderBrick(brick, tile);
+            frame.setTile(tile);
+        });
         return frame;
     }
 

@@ -334,9 +334,8 @@ public:
     {
         params.declared = true;
         fromWorld_.set(params, fb_, world_, camera);
-        auto frame = fb_.begin(params, tileData, pixelData);
+        auto frame = fb_.begin(params, tileData, pixelData, fromWorld_.failure());
         frame.guard([&] {
-            fromWorld_.rethrow();
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
             work_.findJobs(frame, world_, owner_);
@@ -404,9 +403,8 @@ public:
     {
         params.declared = false;
         fromWorld_.set(params, fb_, world_, camera, true);
-        auto frame = fb_.begin(params, tileData, pixelData);
+        auto frame = fb_.begin(params, tileData, pixelData, fromWorld_.failure());
         frame.guard([&] {
-            fromWorld_.rethrow();
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             work_.sortFrontToBack(world_, order);
             work_.findJobs(frame, world_, owner_);

@@ -25,6 +25,15 @@ using FrameBuffer = dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, dfb::InprocT
 
 const dfb::PerspectiveCamera pinhole({0, 1, 8}, {0, 0, 0}, {0, 1, 0}, 35);
 
+// Waits for something that other ranks do, but not for ever.
+template <class IsDone>
+void waitUntil(const IsDone& isDone)
+{
+    const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(10);
+    while (!isDone() && std::chrono::steady_clock::now() < limit)
+        std::this_thread::yield();
+}
+
 // Throws on rank 1 when it is asked where its rays begin.
 struct BrokenCamera {
     int rank = 0;
@@ -110,33 +119,40 @@ TEST_CASE("A cost that is not a number leaves the work shared out evenly", "[mix
 
 TEST_CASE("What a camera throws on one rank is what all ranks report", "[mixed]")
 {
-    std::atomic<int> told{0};
-    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
-        FrameBuffer<dfb::AlphaBlend> fb(communicator, {64, 64});
-        const auto id = static_cast<std::uint32_t>(fb.rank());
-        const dfb::SharedWorld world(fb, dfb::World({{id, {{-1, -1, -1.0f - id}, {1, 1, -0.0f - id}}}}));
-        dfb::RoundRobinBricks owner;
-        dfb::MixedParallelLoop loop(fb, world, owner);
-        try {
-            loop.render(BrokenCamera{fb.rank()}, [](const dfb::Brick&, auto&) {});
-        } catch (const dfb::FrameError& e) {
-            told += e.info().kind == dfb::ErrorKind::UserCode && e.info().rank == 1
-                    && std::string(e.what()).find("no eye") != std::string::npos;
-        }
-    });
-    CHECK(told == 3);
+    // A late rank 1 gets the inputs of the others before it begins the frame. They have no depth, as these ranks have
+    // an order.
+    for (const bool isLate : {false, true}) {
+        INFO((isLate ? "late" : "in time"));
+        std::atomic<int> told{0}, sent{0};
+        dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+            dfb::FrameBufferConfig config{64, 64};
+            config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+            FrameBuffer<dfb::AlphaBlend> fb(communicator, config);
+            const auto id = static_cast<std::uint32_t>(fb.rank());
+            const dfb::SharedWorld world(fb, dfb::World({{id, {{-1, -1, -1.0f - id}, {1, 1, -0.0f - id}}}}));
+            dfb::RoundRobinBricks owner;
+            dfb::MixedParallelLoop loop(fb, world, owner);
+            if (isLate && fb.rank() == 1)
+                waitUntil([&] { return sent == 2; });
+            auto frame = loop.start(BrokenCamera{fb.rank()}, [](const dfb::Brick&, auto& tile) {
+                tile.forEachPixel([](int, int, float* rgba, float&) { rgba[3] = 1; });
+            });
+            ++sent;
+            try {
+                frame.end();
+            } catch (const dfb::FrameError& e) {
+                told += e.info().kind == dfb::ErrorKind::UserCode && e.info().rank == 1
+                        && std::string(e.what()).find("no eye") != std::string::npos;
+            }
+        });
+        CHECK(told == 3);
+    }
 }
 
 // The first brick hides the other in one frame, and throws in the next. Rank 1 is late, so it has been told to wait.
 TEST_CASE("Nobody waits for word of an input whose renderer has thrown", "[mixed]")
 {
-    using Clock = std::chrono::steady_clock;
     std::atomic<bool> hasThrown{false}, isSeen{false};
-    const auto waitFor = [](const std::atomic<bool>& flag) {
-        const auto limit = Clock::now() + std::chrono::seconds(10);
-        while (!flag && Clock::now() < limit)
-            std::this_thread::yield();
-    };
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config{64, 64};
         config.quiet = std::chrono::seconds(30);
@@ -151,7 +167,7 @@ TEST_CASE("Nobody waits for word of an input whose renderer has thrown", "[mixed
         dfb::FrameConfig params;
         params.allowPartial = true;
         if (fb.rank() == 1)
-            waitFor(hasThrown);
+            waitUntil([&] { return hasThrown.load(); });
         auto frame = loop.start(
             pinhole, order,
             [&](const dfb::Brick& brick, auto& tile) {
@@ -162,7 +178,7 @@ TEST_CASE("Nobody waits for word of an input whose renderer has thrown", "[mixed
             },
             params);
         if (fb.rank() == 0) {
-            waitFor(isSeen);
+            waitUntil([&] { return isSeen.load(); });
             frame.cancel();
         }
         frame.end();
