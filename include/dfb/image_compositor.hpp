@@ -454,7 +454,7 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
     try {
         if (frame.passes != 1 || frame.samples)
             detail::failArgument("a picture of images has one sample a pixel");
-        send(image, place, blend_ != ImageBlend::InOrder || config().image.depth);
+        send(image, place, (engine_->sent() & depthChannel) != 0);
     } catch (...) {
         engine_->abort(engine_->frame(), std::current_exception(), -1);
     }

@@ -11,6 +11,8 @@
 #include <cstring>
 #include <exception>
 #include <limits>
+#include <memory>
+#include <numeric>
 #include <stdexcept>
 #include <tuple>
 #include <type_traits>
@@ -318,6 +320,48 @@ struct AtInfinity {
     }
 };
 
+// With FrameConfig::order no depth is sent. Pixels at farDepth are empty all the same: those of all ranks but the last.
+struct FarInOrder {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        dfb::ImageCompositor compositor(dfb::connect<Transport>(communicator), dfb::ImageBlend::ByDepth,
+                                        dfb::FrameBufferConfig(imageWidth, imageHeight));
+        const bool isLast = compositor.rank() == compositor.size() - 1;
+        const auto pixelCount = static_cast<std::size_t>(imageWidth) * imageHeight;
+        const std::uint8_t red = isLast ? 0 : 255, blue = isLast ? 255 : 0;
+        std::vector<std::uint8_t> bytes;
+        for (std::size_t i = 0; i < pixelCount; ++i)
+            bytes.insert(bytes.end(), {red, 0, blue, 255});
+        std::vector<float> floats;
+        for (const std::uint8_t byte : bytes)
+            floats.push_back(byte > 0 ? 1.0f : 0.0f);
+        const std::vector<float> depths(pixelCount, isLast ? 0.5f : 1.0f);
+        std::vector<std::uint32_t> ranks(static_cast<std::size_t>(compositor.size()));
+        std::iota(ranks.begin(), ranks.end(), 0u);
+        dfb::FrameConfig frame;
+        frame.order = std::make_shared<const dfb::SourceOrder>(ranks);
+        for (const bool isFloat : {false, true})
+            for (const bool stays : {false, true}) {
+                dfb::InputImage image(bytes.data(), depths.data());
+                if (isFloat) {
+                    image.rgba8 = nullptr;
+                    image.rgba32f = floats.data();
+                }
+                image.farDepth = 1;
+                image.staysUntilEnd = stays;
+                compositor.composite(image, frame);
+                int wrong = 0;
+                for (std::size_t i = 0; i < compositor.image().pixelCount(); ++i)
+                    wrong += compositor.image().rgba8()[4 * i] != 0;
+                result.expect(wrong == 0, std::to_string(wrong) + " pixels of what is empty, in "
+                                              + (isFloat ? "floats" : "bytes") + (stays ? " that stay" : ""));
+            }
+        return result;
+    }
+};
+
 // A rank that shows nothing needs no place in the order; one that shows something needs one.
 struct Places {
     template <class Transport>
@@ -484,6 +528,8 @@ TEST_CASE("A pixel at infinite depth is in the picture whatever form its image h
 {
     everywhere<AtInfinity>();
 }
+
+TEST_CASE("A pixel at farDepth is empty in a picture with an order", "[image_compositor]") { everywhere<FarInOrder>(); }
 
 TEST_CASE("Only a rank that shows something needs a place in the order", "[image_compositor]") { everywhere<Places>(); }
 
