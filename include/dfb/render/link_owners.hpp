@@ -19,7 +19,8 @@ DFB_NAMESPACE_BEGIN
 namespace detail {
 
 // All ranks call the same members with the same values, and get the same owners: no message is needed. Keeps its memory
-// from frame to frame. For each frame, call start(), then add() for all pixels that some rank has, then find().
+// from frame to frame; only owners that have changed are a new list. For each frame, call start(), then add() for all
+// pixels that some rank has, then find().
 class LinkOwners {
 public:
     // `nodeOf`: for each rank, the lowest rank of its node.
@@ -63,7 +64,6 @@ private:
         double in = 0, out = 0;
     };
 
-    TileOwners keep();
     static double areaOf(const Region& r) { return static_cast<double>(r.width()) * static_cast<double>(r.height()); }
     int nodeOf(int rank) const { return nodeOf_[static_cast<std::size_t>(rank)]; }
     Link& linkOf(int node) { return links_[static_cast<std::size_t>(node)]; }
@@ -129,7 +129,6 @@ private:
     std::vector<double> work_;                 // pixels that each rank has to blend
     std::vector<int> nodes_, owners_;          // of each tile
     TileOwners last_;
-    std::vector<std::shared_ptr<std::vector<int>>> lists_;
 };
 
 #if DFB_HAS_BODIES
@@ -152,20 +151,8 @@ DFB_COMPILED_ONCE TileOwners LinkOwners::find(const FrameBufferConfig& config, b
     for (int tile = 0; tile < layout_.tileCount(); ++tile)
         owners_.push_back(isAnywhere(tile) ? leastBusy(tile) : elsewhere(tile));
     if (!last_ || *last_ != owners_)
-        last_ = keep();
+        last_ = std::make_shared<const std::vector<int>>(owners_);
     return last_;
-}
-
-// Returns owners_ in a list that no open frame uses.
-DFB_COMPILED_ONCE TileOwners LinkOwners::keep()
-{
-    for (const auto& list : lists_)
-        if (list.use_count() == 1) {
-            *list = owners_;
-            return list;
-        }
-    lists_.push_back(std::make_shared<std::vector<int>>(owners_));
-    return lists_.back();
 }
 
 DFB_COMPILED_ONCE void LinkOwners::sortByTile()
