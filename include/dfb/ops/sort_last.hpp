@@ -160,19 +160,16 @@ private:
         std::vector<std::uint8_t> isUndefined;
         NearestBytes nearest;
         std::vector<std::uint8_t> levels; // of a row
-    };
-
-    struct Exact {
-        std::vector<DoubleDouble> mean;
-        CompositeRow row;
-        FragmentCompositor compositor;
+        // For exactRow().
+        std::vector<DoubleDouble> exactMean;
+        CompositeRow exactRow;
+        FragmentCompositor exactCompositor;
     };
 
     // One object per thread, so that a frame after the first allocates nothing.
-    template <class Which>
-    static Which& scratch()
+    static Scratch& scratch()
     {
-        static thread_local Which ofThread;
+        static thread_local Scratch ofThread;
         return ofThread;
     }
 
@@ -415,7 +412,7 @@ DFB_COMPILED_ONCE void FragmentStore::sort(std::vector<const Fragment*>& pointer
 // Brings a compositor for each pass to the first row of its fragments.
 DFB_COMPILED_ONCE FragmentStore::Scratch& FragmentStore::start()
 {
-    auto& scratch = FragmentStore::scratch<Scratch>();
+    Scratch& scratch = FragmentStore::scratch();
     sort(scratch.pointers);
     scratch.compositors.resize(std::max(scratch.compositors.size(), static_cast<std::size_t>(info_.passes)));
     forEachPass(scratch.pointers,
@@ -568,16 +565,16 @@ DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, dou
 DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y)
 {
     const int width = info_.region.width();
-    Exact& exact = scratch<Exact>();
-    CompositeRow& row = exact.row;
-    std::vector<DoubleDouble>& mean = exact.mean;
+    Scratch& scratch = FragmentStore::scratch();
+    CompositeRow& row = scratch.exactRow;
+    std::vector<DoubleDouble>& mean = scratch.exactMean;
     mean.assign(4 * static_cast<std::size_t>(width), {});
     row.minTransmittance = static_cast<double>(info_.minTransmittance);
-    forEachPass(scratch<Scratch>().pointers, [&](std::size_t, auto begin, auto end) {
-        exact.compositor.start(rule(), begin, end, false);
-        exact.compositor.skipRows(y);
+    forEachPass(scratch.pointers, [&](std::size_t, auto begin, auto end) {
+        scratch.exactCompositor.start(rule(), begin, end, false);
+        scratch.exactCompositor.skipRows(y);
         row.resize(width, 0, true);
-        exact.compositor.nextRow(row);
+        scratch.exactCompositor.nextRow(row);
         overBackground(row, 0, width, info_.background.data());
         for (std::size_t i = 0; i < mean.size(); ++i)
             mean[i] = mean[i] + DoubleDouble{row.rgba[i], row.rgbaLow[i]};
