@@ -164,18 +164,18 @@ DFB_DETECTS(has_plan_v,
 
 // The jobs of a mixed-parallel frame.
 struct MixedWork {
-    std::vector<BrickInTile> pairs;
-    std::vector<int> passes;  // how many passes each pair has
-    std::vector<Job> jobs;    // of this rank; `item` is an index into `pairs`
-    std::vector<int> perTile; // how many pairs each tile has
+    std::vector<BrickInTile> pairs; // tile by tile
+    std::vector<int> passes;        // how many passes each pair has
+    std::vector<Job> jobs;          // of this rank; `item` is an index into `pairs`
 
     // The most bricks that meet in a tile.
-    int mostPerTile(int tileCount)
+    int mostPerTile() const
     {
-        perTile.assign(static_cast<std::size_t>(tileCount), 0);
-        int most = 1;
-        for (const BrickInTile& pair : pairs)
-            most = std::max(most, ++perTile[static_cast<std::size_t>(pair.tile)]);
+        int most = 1, count = 0;
+        for (std::size_t p = 0; p < pairs.size(); ++p) {
+            count = p > 0 && pairs[p].tile == pairs[p - 1].tile ? count + 1 : 1;
+            most = std::max(most, count);
+        }
         return most;
     }
 
@@ -337,7 +337,7 @@ public:
         auto frame = fb_.begin(params, tileData, pixelData, fromWorld_.failure());
         frame.guard([&] {
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
-            frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
+            frame.expectLayers(work_.mostPerTile());
             work_.findJobs(frame, world_, owner_);
             // The first rank that holds the brick declares the tile, even if another one renders it.
             inputs_.clear();
@@ -408,7 +408,7 @@ public:
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             work_.sortFrontToBack(world_, order);
             work_.findJobs(frame, world_, owner_);
-            frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
+            frame.expectLayers(work_.mostPerTile());
             work_.findEmpty(fb_.layout().tileCount(), frame.ownedTiles());
             frame.template forEachTile<typename FrameBuffer::TileView>(work_.empty,
                                                                        [&](const auto& tile) { frame.setTile(tile); });
