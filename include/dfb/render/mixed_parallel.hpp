@@ -179,8 +179,9 @@ struct MixedWork {
         return most;
     }
 
+    // Finds the jobs that `owner` gives to the rank `own`.
     template <class Frame, class Owner>
-    void findJobs(const Frame& frame, const SharedWorld& world, Owner& owner)
+    void findJobs(const Frame& frame, const SharedWorld& world, Owner& owner, int own)
     {
         passes.clear();
         for (const BrickInTile& pair : pairs)
@@ -196,7 +197,7 @@ struct MixedWork {
                     detail::failArgument(
                         "the tile-brick owner gives tile %d of brick %u to rank %d, which does not hold it",
                         pairs[p].tile, brick.id, rank);
-                if (rank == world.rank())
+                if (rank == own)
                     jobs.push_back({p, pass});
             }
         }
@@ -338,7 +339,7 @@ public:
         frame.guard([&] {
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             frame.expectLayers(work_.mostPerTile());
-            work_.findJobs(frame, world_, owner_);
+            work_.findJobs(frame, world_, owner_, fb_.rank());
             // The first rank that holds the brick declares the tile, even if another one renders it.
             inputs_.clear();
             for (const BrickInTile& pair : work_.pairs)
@@ -407,7 +408,7 @@ public:
         frame.guard([&] {
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             work_.sortFrontToBack(world_, order);
-            work_.findJobs(frame, world_, owner_);
+            work_.findJobs(frame, world_, owner_, fb_.rank());
             frame.expectLayers(work_.mostPerTile());
             work_.findEmpty(fb_.layout().tileCount(), frame.ownedTiles());
             frame.template forEachTile<typename FrameBuffer::TileView>(work_.empty,

@@ -32,7 +32,7 @@ public:
     // for all ranks. Throws InvalidArgument on all ranks if the bounds of one brick differ between ranks, or if the
     // bricks of a rank cannot be read. Throws TransportError.
     template <class FrameBuffer>
-    SharedWorld(FrameBuffer& fb, const World& world) : rank_(fb.rank())
+    SharedWorld(FrameBuffer& fb, const World& world)
     {
         static_assert(std::is_trivially_copyable_v<Brick>);
         const auto* first = reinterpret_cast<const std::byte*>(world.bricks().data());
@@ -69,11 +69,7 @@ public:
     // Sorted by ascending id.
     const std::vector<SharedBrick>& bricks() const noexcept { return bricks_; }
 
-    // This rank.
-    int rank() const noexcept { return rank_; }
-
 private:
-    int rank_;
     std::vector<SharedBrick> bricks_;
 };
 
