@@ -145,14 +145,14 @@ DFB_INLINE bool arePixelsInRange(const float* rgba, int count, float maxColor) n
 #if defined(DFB_HAS_AVX2_CLONES)
 constexpr int toNearest = _MM_FROUND_TO_NEAREST_INT;
 // The factors for two pixels.
-DFB_AVX2_F16C inline __m256 wireVector(float color, float alpha) noexcept
+DFB_AVX2 inline __m256 wireVector(float color, float alpha) noexcept
 {
     return _mm256_setr_ps(color, color, color, alpha, color, color, color, alpha);
 }
 #endif
 
 template <class Code>
-DFB_AVX2_F16C inline void encodePixelsAvx2(const float* rgba, int count, const WireScales& by, std::byte* out) noexcept
+DFB_AVX2 inline void encodePixelsAvx2(const float* rgba, int count, const WireScales& by, std::byte* out) noexcept
 {
     constexpr std::size_t wordBytes = sizeof(typename Code::Word);
     int i = 0;
@@ -186,7 +186,7 @@ DFB_AVX2_F16C inline void encodePixelsAvx2(const float* rgba, int count, const W
 }
 
 template <class Code>
-DFB_AVX2_F16C inline bool decodePixelsAvx2(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
+DFB_AVX2 inline bool decodePixelsAvx2(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
 {
     constexpr std::size_t wordBytes = sizeof(typename Code::Word);
     int i = 0;
@@ -216,7 +216,7 @@ DFB_AVX2_F16C inline bool decodePixelsAvx2(const std::byte* in, int count, const
     return decodePixels<Code>(in + 4 * wordBytes * static_cast<std::size_t>(i), count - i, by, rgba + 4 * i) && inRange;
 }
 
-DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, float maxColor) noexcept
+DFB_AVX2 inline bool arePixelsInRangeAvx2(const float* rgba, int count, float maxColor) noexcept
 {
     int i = 0, inRange = 0xff; // a bit for each lane
 #if defined(DFB_HAS_AVX2_CLONES)
@@ -335,7 +335,7 @@ public:
     // Whether pixels may travel in a format other than Float32.
     bool inRange(const float* rgba, int count) const noexcept
     {
-        return cpuHasF16c() ? arePixelsInRangeAvx2(rgba, count, maxColor_) : arePixelsInRange(rgba, count, maxColor_);
+        return DFB_FASTEST(arePixelsInRange, arePixelsInRangeAvx2, rgba, count, maxColor_);
     }
 
     // Encodes `count` pixels, which are in range unless the format is Float32. `out` gets 4 * bytesOf(format) bytes for
@@ -345,7 +345,7 @@ public:
         const auto encode = [&](auto code, float colorScale, float alphaScale) {
             using Code = decltype(code);
             const WireScales by{colorScale, alphaScale};
-            cpuHasF16c() ? encodePixelsAvx2<Code>(rgba, count, by, out) : encodePixels<Code>(rgba, count, by, out);
+            DFB_FASTEST(encodePixels<Code>, encodePixelsAvx2<Code>, rgba, count, by, out);
         };
         switch (format) {
         case WireFormat::Float32: std::memcpy(out, rgba, 4 * sizeof(float) * static_cast<std::size_t>(count)); return;
@@ -364,8 +364,7 @@ public:
             using Code = decltype(code);
             const auto pixels = static_cast<int>(count);
             const WireScales by{colorScale, alphaScale, activeByDepth_ ? 0.0f : leastAlpha};
-            return cpuHasF16c() ? decodePixelsAvx2<Code>(in, pixels, by, rgba)
-                                : decodePixels<Code>(in, pixels, by, rgba);
+            return DFB_FASTEST(decodePixels<Code>, decodePixelsAvx2<Code>, in, pixels, by, rgba);
         };
         switch (format) {
         case WireFormat::Float32: std::memcpy(rgba, in, 4 * sizeof(float) * count); break;

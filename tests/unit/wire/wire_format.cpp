@@ -408,7 +408,7 @@ int wrongEncoded(const std::vector<float>& values)
         const std::size_t bytes = 4 * sizeof(Word) * static_cast<std::size_t>(count);
         std::vector<std::byte> fast(bytes + offset + 64, std::byte{0xa5}), plain(fast);
         encodePixels<Code>(values.data() + first, count, one, plain.data() + offset);
-        if (cpuHasF16c())
+        if (cpuHasAvx2())
             encodePixelsAvx2<Code>(values.data() + first, count, one, fast.data() + offset);
         else
             encodePixels<Code>(values.data() + first, count, one, fast.data() + offset);
@@ -443,7 +443,7 @@ int wrongDecoded(std::size_t count)
     const auto check = [&](std::size_t first, int pixels) { // begins within a word, which must work as well
         std::vector<float> fast(4 * static_cast<std::size_t>(pixels) + 8, -7), plain(fast);
         const bool plainIn = decodePixels<Code>(bytes.data() + first, pixels, by, plain.data());
-        const bool fastIn = cpuHasF16c() ? decodePixelsAvx2<Code>(bytes.data() + first, pixels, by, fast.data())
+        const bool fastIn = cpuHasAvx2() ? decodePixelsAvx2<Code>(bytes.data() + first, pixels, by, fast.data())
                                          : decodePixels<Code>(bytes.data() + first, pixels, by, fast.data());
         bool isIn = true;
         wrong += std::memcmp(fast.data(), plain.data(), fast.size() * sizeof(float)) != 0;
@@ -487,7 +487,7 @@ TEST_CASE("Each channel has its scale", "[wire_codes]")
     std::vector<std::uint8_t> codes(rgba.size());
     encodePixels<Unorm8Code>(rgba.data(), 19, by, reinterpret_cast<std::byte*>(codes.data()));
     CHECK(codes == expected);
-    if (cpuHasF16c()) {
+    if (cpuHasAvx2()) {
         codes.assign(codes.size(), 0);
         encodePixelsAvx2<Unorm8Code>(rgba.data(), 19, by, reinterpret_cast<std::byte*>(codes.data()));
         CHECK(codes == expected);
@@ -514,7 +514,7 @@ TEST_CASE("A pixel out of range is seen wherever it is", "[wire_codes]")
                 for (int i = 0; i < 4 * width; ++i)
                     rgba[i] = i % 4 == 3 ? 1.0f : maxColor * static_cast<float>(random() >> 8) * 0x1p-24f;
                 wrong += !arePixelsInRange(rgba, width, maxColor);
-                wrong += cpuHasF16c() && !arePixelsInRangeAvx2(rgba, width, maxColor);
+                wrong += cpuHasAvx2() && !arePixelsInRangeAvx2(rgba, width, maxColor);
                 const std::size_t pixel = random() % static_cast<unsigned>(width), channel = random() % 4;
                 float* at = rgba + 4 * pixel;
                 const float alphas[] = {1.0f, 0.5f, 0x1p-149f, 0.0f, -0.0f};
@@ -535,7 +535,7 @@ TEST_CASE("A pixel out of range is seen wherever it is", "[wire_codes]")
                 for (int c = 0; c < 3; ++c)
                     expected = expected && at[c] >= 0 && at[c] <= maxColor * at[3];
                 wrong += arePixelsInRange(rgba, width, maxColor) != expected;
-                wrong += cpuHasF16c() && arePixelsInRangeAvx2(rgba, width, maxColor) != expected;
+                wrong += cpuHasAvx2() && arePixelsInRangeAvx2(rgba, width, maxColor) != expected;
             }
     CHECK(wrong == 0);
 }
