@@ -21,6 +21,7 @@
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <optional>
 #include <string>
 #include <thread>
@@ -259,10 +260,16 @@ public:
         return Bytes(message.data() + sizeof(MessageHeader) + sizeof(std::uint32_t), message.data() + message.size());
     }
 
+    // Without this message the reduction would never have a result. So it ends the connection if this rank lacks the
+    // memory for it.
     void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
     {
-        reductions_.receive(source, {scopeOf(message), header.number}, header.kind == MessageKind::ReduceUp,
-                            bytesOf(message));
+        try {
+            reductions_.receive(source, {scopeOf(message), header.number}, header.kind == MessageKind::ReduceUp,
+                                bytesOf(message));
+        } catch (const std::bad_alloc& e) {
+            giveUp(source, errorInfo(ErrorKind::Transport, e.what()));
+        }
     }
 
     // Keeps the error of a message that could not be read. The message may have been for something that this rank has
@@ -372,6 +379,9 @@ public:
                               });
         } catch (const Error& e) { // an earlier message of a rank below in the tree is malformed
             giveUp(-1, e.info());
+        } catch (const std::bad_alloc& e) { // the others would wait for this rank's part
+            giveUp(-1, errorInfo(ErrorKind::Transport, e.what()));
+            throw;
         }
         waitForResult([&] { return result->there.load(); }, number == 0, std::move(damage));
         return result->bytes;

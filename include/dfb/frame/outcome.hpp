@@ -15,6 +15,7 @@
 #include <cstdint>
 #include <exception>
 #include <functional>
+#include <new>
 #include <optional>
 #include <string>
 #include <utility>
@@ -304,6 +305,8 @@ private:
         } catch (const Error& e) {
             // Without this message the reduction would never have a result.
             mailbox_.giveUp(source, e.info());
+        } catch (const std::bad_alloc& e) {
+            mailbox_.giveUp(source, errorInfo(ErrorKind::Transport, e.what()));
         }
     }
 

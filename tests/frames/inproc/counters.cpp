@@ -678,6 +678,36 @@ TEST_CASE("A lack of memory for finished tiles costs a partial frame no other ti
     CHECK(shown == 3);
 }
 
+TEST_CASE("A rank that lacks memory to combine parts of a reduction ends it on every rank", "[counters]")
+{
+    const bool isLate = GENERATE(false, true); // true: rank 0 combines in the call itself, not in a task
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        const auto executor = std::make_shared<dfb::CallerExecutor>();
+        dfb::FrameBufferConfig config(64, 64, dfb::OutputFormat::RGBA32F);
+        config.executor = executor;
+        OneTile fb(communicator, config);
+        std::string& text = texts[static_cast<std::size_t>(fb.rank())];
+        const std::vector<std::byte> mine(fb.rank() == 0 ? 1000000 : 1000); // together too many
+        fb.allReduce({0}, OneTile::Reduce::Sum);
+        largestAllocation = 1500000;
+        while (isLate && fb.rank() == 0 && !executor->help()) // until the part of rank 1 is here
+            std::this_thread::yield();
+        try {
+            fb.allGather(mine);
+        } catch (const dfb::TransportError& e) {
+            text = e.what();
+        } catch (const std::bad_alloc&) {
+            text = "no memory";
+        }
+    });
+    largestAllocation = std::numeric_limits<std::size_t>::max();
+    INFO(texts[0] << "; " << texts[1]);
+    CHECK((isLate ? texts[0] == "no memory" : texts[0] == texts[1]));
+    CHECK(texts[1].find("rank 0") != std::string::npos);
+    CHECK(texts[1].find(std::bad_alloc().what()) != std::string::npos);
+}
+
 TEST_CASE("What is too large for memory is named with its bytes and its rank, on every rank", "[counters]")
 {
     using dfb::OutputFormat;
