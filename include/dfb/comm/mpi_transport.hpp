@@ -627,12 +627,14 @@ private:
         return moveUntil([&] { return completed(request); });
     }
 
-    // Once all ranks are here, none of them needs an answer. Then each rank says goodbye to those that it has sent to,
-    // with an empty packet sent synchronously: when that send has completed, the receiver has all packets that went
-    // before. Once this is so on all ranks, only announced bodies can be on the way. Returns false as moveUntil() does.
+    // Once nothing waits to be sent on any rank, none of them needs an answer. Until then each gives signs of life, so
+    // that none is taken for lost while others still move messages. Then each rank says goodbye to those that it has
+    // sent to, with an empty packet sent synchronously: when that send has completed, the receiver has all packets that
+    // went before. Once this is so on all ranks, only announced bodies can be on the way. Returns false as moveUntil()
+    // does.
     bool finish()
     {
-        if (!barrier() || !moveUntil([this] { return quiet(); }))
+        if (!barrier() || !moveUntil([this] { return quiet(); }) || !barrier())
             return false;
         leaving_ = true;
         std::vector<MPI_Request> goodbyes;
@@ -649,7 +651,8 @@ private:
             return false;
         // A receive that cannot be cancelled any more has a packet.
         cancelPackets([this](const Transfer& packet, const MPI_Status& status) { unpack(packet, status); });
-        return moveUntil([this] { return announced_.empty() && receives_.requests.empty(); });
+        return moveUntil(
+            [this] { return announced_.empty() && receives_.requests.empty() && sends_.requests.empty(); });
     }
 
     // Cancels the posted receives. Calls `came(packet, status)` for those that have got a packet before.
