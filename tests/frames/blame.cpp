@@ -493,7 +493,8 @@ struct BlamedLeaving {
                 else
                     expectText(
                         result, "a rank that leaves", text,
-                        {"TransportError: ", rankText(leaver) + ": it has destroyed its framebuffer after frame 1",
+                        {"TransportError: ",
+                         rankText(leaver) + ": it has destroyed its framebuffer, compositor or wall after frame 1",
                          "is in " + name});
             }
         return result;

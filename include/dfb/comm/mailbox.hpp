@@ -658,7 +658,7 @@ private:
                 continue;
             const bool isInFrame = epoch_ > left.epoch, isThrown = left.how.exceptions > 0;
             const std::string text = printed(
-                "%s its framebuffer after frame %lld, and rank %d is in %s %lld%s",
+                "%s its framebuffer, compositor or wall after frame %lld, and rank %d is in %s %lld%s",
                 isThrown ? "an exception has ended" : "it has destroyed", static_cast<long long>(left.epoch), rank(),
                 isInFrame ? "frame" : "collective call", static_cast<long long>(isInFrame ? epoch_ : reductionCount_),
                 isThrown ? "" : ": all ranks must make the same calls");
