@@ -102,10 +102,8 @@ public:
     // This rank's memory, if another rank sees it; else null.
     const std::shared_ptr<NodeMemory>& memory() const noexcept { return memory_; }
     bool doAllSeeMine() const noexcept { return doAllSeeMine_; }
-    // How many ranks of this node, including this one, may run on this rank's processors; and the number of these
-    // processors.
+    // How many ranks of this node, including this one, may run on this rank's processors.
     int sharingRanks() const noexcept { return sharingRanks_; }
-    int processors() const noexcept { return processors_; }
 
 private:
     void check(int code, const char* call) const { checkMpi(code, call, rank_); }
@@ -174,7 +172,6 @@ private:
         sharingRanks_ = static_cast<int>(std::count_if(all.begin(), all.end(), [&](const Card& card) {
             return card.isOfNode(mine) && card.processors.meets(mine.processors);
         }));
-        processors_ = std::max(1, mine.processors.count());
 
         // Each tells the others whose memory it sees.
         std::vector<std::uint8_t> sees(all.size()), seen(all.size());
@@ -220,7 +217,7 @@ private:
 
     MPI_Comm comm_ = MPI_COMM_NULL;
     int rank_ = 0, size_ = 1;
-    int sharingRanks_ = 1, processors_ = 1;
+    int sharingRanks_ = 1;
     std::vector<Other> others_;
     std::shared_ptr<NodeMemory> memory_;
     bool doAllSeeMine_ = false;

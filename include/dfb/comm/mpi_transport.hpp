@@ -11,6 +11,7 @@
 // Receives of packets are posted beforehand: nothing is ever probed for. They take 64 KiB per transport.
 #pragma once
 
+#include <dfb/base/cpu.hpp>
 #include <dfb/base/fifo.hpp>
 #include <dfb/base/function_ref.hpp>
 #include <dfb/comm/connection.hpp>
@@ -224,7 +225,8 @@ private:
     // that many ranks wake up, and each takes the core from that many.
     int oversubscription() const
     {
-        const std::int64_t ranksPerCore = std::int64_t{4} * ranks_.sharingRanks() / ranks_.processors(); // in quarters
+        const std::int64_t ranksPerCore =
+            std::int64_t{4} * ranks_.sharingRanks() / Processors::ofThisThread().count(); // in quarters
         return static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
     }
 
