@@ -508,9 +508,8 @@ private:
             for (const int other : askers)
                 sendSign(other, detail::MessageKind::Pong);
         }
-        if (!heartbeat_.isOn() || failed_ || now < nextBeat_)
+        if (!heartbeat_.isOn() || failed_ || !heartbeat_.isDue(now)) // only due(), below, changes when it is due
             return;
-        nextBeat_ = now + heartbeat_.interval();
         detail::Heartbeat::Due due;
         {
             const std::lock_guard<std::mutex> lock(peersMutex_);
@@ -560,7 +559,6 @@ private:
     std::vector<int> askers_; // the ranks that have sent a Ping
 
     std::atomic<bool> isAsked_{false}; // there are askers
-    Clock::time_point nextBeat_{};     // only the thread that polls uses it
 
     std::mutex mutex_; // held while a receiver is called, so that detach() waits for the call
     std::vector<Receiver> receivers_;

@@ -43,8 +43,8 @@ public:
 
     // A rank that has sent nothing for this long is asked. It must answer in less time than this.
     Duration patience() const noexcept { return timeout_ / 4; }
-    // How often to call due().
-    Duration interval() const noexcept { return timeout_ / 32; }
+    // Whether it is time to call due().
+    bool isDue(Time now) const { return now - last_ >= timeout_ / 32; }
 
     // A message has come from that rank. `promises`: by this message the rank says that it answers at any time. Until
     // it has said so, it is neither asked nor counted as lost.

@@ -21,7 +21,7 @@ using dfb::detail::treeNeighbours;
 using std::chrono::milliseconds;
 
 constexpr int timeoutMs = 3200;
-constexpr int stepMs = 100; // interval()
+constexpr int stepMs = 100; // after so long due() is called again
 
 // A Heartbeat whose clock the test advances.
 struct Rank {
@@ -43,6 +43,7 @@ struct Rank {
     {
         now += milliseconds(byMs);
         ms += byMs;
+        CHECK(beat.isDue(now) == (byMs >= stepMs || ms == 0));
         const auto due = beat.due(now, expecting);
         asked.insert(asked.end(), due.ask.begin(), due.ask.end());
         if (due.lost >= 0 && lost < 0)
