@@ -42,58 +42,6 @@ enum class CompressionMode : std::uint8_t {
 
 namespace detail {
 
-// CompressionGains: the ranks for which compression makes this rank's messages smaller. The pixels for one rank can be
-// noise, those for another all alike. A rank for which nearly nothing was gained is left alone for some frames and then
-// tried again, more and more seldom. During a frame any thread may call add() and isWorthwhile(); the others are called
-// between frames.
-class CompressionGains {
-public:
-    explicit CompressionGains(int rankCount) : peers_(static_cast<std::size_t>(rankCount)) {}
-
-    bool isWorthwhile(int rank) const { return peers_[static_cast<std::size_t>(rank)].pause == 0; }
-
-    // Notes a message to that rank: it has `raw` bytes without the codec, and is sent as `sent` bytes.
-    void add(int rank, std::size_t raw, std::size_t sent)
-    {
-        Peer& peer = peers_[static_cast<std::size_t>(rank)];
-        peer.raw += static_cast<std::int64_t>(raw);
-        peer.sent += static_cast<std::int64_t>(sent);
-    }
-
-    // The number of ranks for which something was compressed since the last endFrame().
-    std::int64_t links() const
-    {
-        return std::count_if(peers_.begin(), peers_.end(), [](const Peer& peer) { return peer.sent < peer.raw; });
-    }
-
-    void endFrame()
-    {
-        for (Peer& peer : peers_) {
-            const auto raw = static_cast<double>(peer.raw.exchange(0)),
-                       sent = static_cast<double>(peer.sent.exchange(0));
-            if (peer.pause > 0) {
-                --peer.pause;
-            } else if (raw > 0 && sent > (peer.interval > firstInterval ? better : worse) * raw) {
-                peer.pause = peer.interval;
-                peer.interval = std::min(2 * peer.interval, longestInterval);
-            } else if (raw > 0) {
-                peer.interval = firstInterval;
-            }
-        }
-    }
-
-private:
-    // Of compressed to raw bytes: above `worse` compression stops, and only below `better` it starts again.
-    static constexpr double worse = 0.95, better = 0.9;
-    static constexpr int firstInterval = 16, longestInterval = 512;
-
-    struct Peer {
-        std::atomic<std::int64_t> raw{0}, sent{0};
-        int pause = 0, interval = firstInterval; // in frames
-    };
-    std::vector<Peer> peers_;
-};
-
 // CompressionTrial: finds out by trying whether a framebuffer's messages are worth compressing, because no formula
 // knows how a network, a codec and the cores work together.
 //
@@ -193,46 +141,78 @@ private:
     std::array<std::vector<double>, 2> times_;                        // without, with
 };
 
-// Compression: which messages of a rank are compressed in a frame. sent() and codecFor() may be called from any thread,
-// endFrame() between frames.
+// Compression: which messages of a rank are compressed in a frame. The pixels for one rank can be noise, those for
+// another all alike. A rank for which nearly nothing was gained is left alone for some frames and then tried again,
+// more and more seldom. sent() and codecFor() may be called from any thread, endFrame() between frames.
 class Compression {
 public:
     // `codec` may be null: then no message is compressed.
     Compression(std::shared_ptr<const Codec> codec, CompressionMode mode, int rankCount)
-        : codec_(std::move(codec)), mode_(mode), gains_(codec_ ? rankCount : 0)
+        : codec_(std::move(codec)), mode_(mode), peers_(codec_ ? static_cast<std::size_t>(rankCount) : 0)
     {
     }
 
     // Whether messages of this frame may be compressed.
     bool isOn() const { return codec_ && (mode_ == CompressionMode::Always || trial_.compresses()); }
 
+    // Whether that rank is not left alone in this frame. There must be a codec.
+    bool isWorthwhile(int other) const { return peers_[static_cast<std::size_t>(other)].pause == 0; }
+
     // Returns the codec for messages with pixels to another rank in this frame, or null for none. `isNear`: that rank
     // sees this one's memory.
     const Codec* codecFor(int other, bool isNear) const
     {
-        const bool isLeftOut = !isOn() || (mode_ == CompressionMode::Auto && (isNear || !gains_.isWorthwhile(other)));
+        const bool isLeftOut = !isOn() || (mode_ == CompressionMode::Auto && (isNear || !isWorthwhile(other)));
         return isLeftOut ? nullptr : codec_.get();
     }
 
     // A message to that rank had `raw` bytes before the codec, and `sent` after it.
-    void sent(int other, std::size_t raw, std::size_t sent) { gains_.add(other, raw, sent); }
+    void sent(int other, std::size_t raw, std::size_t sent)
+    {
+        Peer& peer = peers_[static_cast<std::size_t>(other)];
+        peer.raw += static_cast<std::int64_t>(raw);
+        peer.sent += static_cast<std::int64_t>(sent);
+    }
 
     // The number of ranks for which something was compressed in this frame.
-    std::int64_t links() const { return gains_.links(); }
+    std::int64_t links() const
+    {
+        return std::count_if(peers_.begin(), peers_.end(), [](const Peer& peer) { return peer.sent < peer.raw; });
+    }
 
     // Notes that the frame has not failed, and took this `time` on the slowest rank.
     void endFrame(double time)
     {
         if (codec_)
             trial_.took(time);
-        gains_.endFrame();
+        for (Peer& peer : peers_) {
+            const auto raw = static_cast<double>(peer.raw.exchange(0)),
+                       sent = static_cast<double>(peer.sent.exchange(0));
+            if (peer.pause > 0) {
+                --peer.pause;
+            } else if (raw > 0 && sent > (peer.interval > firstInterval ? better : worse) * raw) {
+                peer.pause = peer.interval;
+                peer.interval = std::min(2 * peer.interval, longestInterval);
+            } else if (raw > 0) {
+                peer.interval = firstInterval;
+            }
+        }
     }
 
 private:
+    // Of compressed to raw bytes: above `worse` compression stops, and only below `better` it starts again.
+    static constexpr double worse = 0.95, better = 0.9;
+    static constexpr int firstInterval = 16, longestInterval = 512;
+
+    struct Peer {
+        std::atomic<std::int64_t> raw{0}, sent{0};
+        int pause = 0, interval = firstInterval; // in frames
+    };
+
     std::shared_ptr<const Codec> codec_;
     CompressionMode mode_;
     CompressionTrial trial_;
-    CompressionGains gains_;
+    std::vector<Peer> peers_;
 };
 
 } // namespace detail

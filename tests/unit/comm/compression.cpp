@@ -1,32 +1,43 @@
-// CompressionGains: a rank for which compression gains nothing is skipped, and tried again more and more rarely.
+// Compression: a rank for which compression gains nothing is skipped, and tried again more and more rarely.
 #include "catch.hpp"
 
 #include <dfb/comm/compression.hpp>
 
 #include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
 #include <random>
 #include <vector>
 
-namespace compression_gains_cases {
+namespace compression_cases {
 
 namespace {
+
+// No test compresses with it.
+struct NoCodec final : dfb::Codec {
+    std::uint8_t id() const noexcept override { return 1; }
+    std::size_t bound(std::size_t byteCount) const override { return byteCount; }
+    std::size_t compress(const std::byte*, std::size_t byteCount, std::byte*) const override { return byteCount; }
+    bool decompress(const std::byte*, std::size_t, std::byte*, std::size_t) const override { return false; }
+};
 
 // The frames, of `frames`, in which compression for rank 1 of 2 is tried, if 1000 bytes to it become `sent(frame)`.
 template <class Sent>
 std::vector<int> triedIn(int frames, const Sent& sent)
 {
-    dfb::detail::CompressionGains gains(2);
+    dfb::detail::Compression compression(std::make_shared<NoCodec>(), dfb::CompressionMode::Auto, 2);
     std::vector<int> tried;
     for (int frame = 0; frame < frames; ++frame) {
-        CHECK(gains.isWorthwhile(0)); // nothing is sent to it
-        if (gains.isWorthwhile(1)) {
+        CHECK(compression.isWorthwhile(0)); // nothing is sent to it
+        if (compression.isWorthwhile(1)) {
             tried.push_back(frame);
-            gains.add(1, 600, static_cast<std::size_t>(sent(frame)) - 400);
-            gains.add(1, 400, 400); // nothing gained with this one
-            CHECK(gains.links() == (sent(frame) < 1000));
+            compression.sent(1, 600, static_cast<std::size_t>(sent(frame)) - 400);
+            compression.sent(1, 400, 400); // nothing gained with this one
+            CHECK(compression.links() == (sent(frame) < 1000));
         }
-        gains.endFrame();
-        CHECK(gains.links() == 0);
+        compression.endFrame(1);
+        CHECK(compression.links() == 0);
     }
     return tried;
 }
@@ -54,7 +65,7 @@ TEST_CASE("A rank that begins to gain is compressed for again, if it is worth it
     CHECK(triedIn(1000, [](int frame) { return frame < 10 ? 1000 : 930; }).size() < 12);
 }
 
-} // namespace compression_gains_cases
+} // namespace compression_cases
 
 // CompressionTrial: finds the better of two ways and keeps it, whatever the noise, and finds it anew when things
 // change.
