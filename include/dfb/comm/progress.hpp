@@ -8,7 +8,6 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
-#include <condition_variable>
 #include <cstdint>
 #include <functional>
 #include <mutex>
@@ -77,16 +76,9 @@ public:
     // milliseconds. False: it does so no more. Calls nest and must balance. From any thread.
     void standIn(bool more)
     {
-        if (more) {
-            ++standIns_;
-            return;
-        }
-        {
-            const std::lock_guard<std::mutex> lock(standInMutex_);
-            --standIns_;
-        }
-        if (expecting_)
-            standInLeft_.notify_one();
+        standIns_ += more ? 1 : -1;
+        if (!more && expecting_)
+            standInLeft_.interrupt();
     }
     bool hasStandIn() const noexcept { return standIns_ > 0; }
     // Whether threads that wait must poll: this one does not run, or has a stand-in.
@@ -129,10 +121,8 @@ private:
         auto last = Clock::now();
         std::uint64_t polls = 0;
         while (!stop_) {
-            if (hasStandIn()) {
-                std::unique_lock<std::mutex> lock(standInMutex_);
-                standInLeft_.wait_for(lock, std::chrono::milliseconds(2), [this] { return !hasStandIn(); });
-            }
+            if (hasStandIn())
+                standInLeft_.nap(std::chrono::milliseconds(2));
             const bool moved = tryPoll();
             const auto now = Clock::now();
             if (polls_ != polls) {
@@ -157,8 +147,7 @@ private:
     std::atomic<std::uint64_t> polls_{0};
     std::atomic<bool> stop_{false};
     std::atomic<int> expecting_{0}, waiting_{0}, standIns_{0};
-    std::mutex standInMutex_;
-    std::condition_variable standInLeft_;
+    NapSignal standInLeft_;
     std::thread thread_;
 };
 
