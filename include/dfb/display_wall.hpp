@@ -73,8 +73,8 @@ public:
     // Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks: TimedOut if a display
     // has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have not sent all of it,
     // because it failed or was partial, or if a display has dropped it; MalformedMessage if a part of it cannot be
-    // right. The displays then keep their picture. Throws TransportError if the connection fails, and InvalidArgument on a thread
-    // that may not call MPI, or for a frame that is not later than the last.
+    // right. The displays then keep their picture. Throws TransportError if the connection fails, and InvalidArgument
+    // on a thread that may not call MPI, or for a frame that is not later than the last.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before

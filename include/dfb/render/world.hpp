@@ -20,7 +20,10 @@ struct Vector3 {
     friend Vector3 operator-(const Vector3& a, const Vector3& b) noexcept { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
     friend Vector3 operator*(Real s, const Vector3& a) noexcept { return {s * a.x, s * a.y, s * a.z}; }
     friend Vector3 operator*(const Vector3& a, Real s) noexcept { return s * a; }
-    friend bool operator==(const Vector3& a, const Vector3& b) noexcept { return a.x == b.x && a.y == b.y && a.z == b.z; }
+    friend bool operator==(const Vector3& a, const Vector3& b) noexcept
+    {
+        return a.x == b.x && a.y == b.y && a.z == b.z;
+    }
 };
 using Vec3 = Vector3<float>;
 using Vec3d = Vector3<double>;
