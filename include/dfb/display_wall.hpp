@@ -39,8 +39,9 @@ struct ToWall {
 //   wall.finish(report.frame);
 //   ... wall.image(display) on the rank that drives it
 //
-// Memory: a rank that drives displays has two images of each, the one that it shows and the one that arrives. At most
-// `poolBytes` are on the way to such a rank.
+// Memory: a rank that drives displays has the image of each that it shows, and one more for each frame of which parts
+// have come before its finish(), 16 at most. The constructor takes memory for one of these; if there is none for
+// another, the connection fails. At most `poolBytes` are on the way to such a rank.
 class DisplayWall {
 public:
     // Makes a wall whose displays show images in `format`. `executor` runs its work; null: threads of its own, beside

@@ -86,12 +86,12 @@ public:
         }
 
         // Sends the active pixels of a rendered tile to its owner. `tile` can be used again when setTile() returns.
-        // Does nothing in a frame that has failed, or after end(). Any thread. Waits only while more than
-        // messages.poolBytes are under way from this rank, and runs tasks of the executor meanwhile; a thread that may
-        // not call MPI does not wait. Throws InvalidArgument, with nothing sent, for a tile of another frame, for an
-        // index, region or pass that the frame does not have, and for a negative generation or number of children.
-        // Throws OutOfMemory. An input that contradicts others (too many, sent twice, not announced) makes the frame
-        // fail: end() throws.
+        // Sends nothing in a frame that has failed, or after end(), but checks the tile even then. Any thread. Waits
+        // only while more than messages.poolBytes are under way from this rank, and runs tasks of the executor
+        // meanwhile; a thread that may not call MPI does not wait. Throws InvalidArgument, with nothing sent, for a
+        // tile of another frame, for an index, region or pass that the frame does not have, for a generation that is
+        // not 0 to 65535, and for a negative number of children. Throws OutOfMemory. An input that contradicts others
+        // (too many, sent twice, not announced) makes the frame fail: end() throws.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
         // Sends pixels that lie in your own memory. They are not read after setTile() has returned, unless you promise
         // TileView::staysUntilEnd. Threads, waiting and exceptions as above. Also throws InvalidArgument if a channel

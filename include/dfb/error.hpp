@@ -47,8 +47,8 @@ enum class ErrorKind : std::uint32_t {
     UnannouncedInput, // an input of a generation or source that nobody announced
     NegativeChildren, // an input announced fewer than zero children
     MalformedMessage, // bytes off the wire that are not a message of this framebuffer
-    Disagreement,     // ranks were given different configurations or frame parameters, or sent more than announced
-    UserCode,         // an exception out of a renderer, a tile operation or a pixel operation
+    Disagreement,     // ranks began a frame with different parameters, or sent more inputs than announced
+    UserCode,         // an exception out of the program's code: a renderer, a camera, an operation, a codec, onTile
     Cancelled,        // a frame was cancelled, or left without end()
     TimedOut,         // a frame was not complete in time
     Transport,        // the transport reported a failure
@@ -87,7 +87,7 @@ struct ErrorInfo {
     std::int64_t tile = -1;
     std::int64_t pass = -1;
     std::int64_t generation = -1;
-    std::int64_t source = -1; // brick id, or rank
+    std::int64_t source = -1; // brick id; the place of an image with ImageBlend::InOrder; else the rank
     std::int64_t expected = -1;
     std::int64_t got = -1;
     std::string message; // the detail in words, may be empty

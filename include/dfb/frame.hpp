@@ -72,10 +72,10 @@ struct FrameBufferConfig {
     std::shared_ptr<Executor> executor{};
     // onTile(tile index, its pixels, image), for windows that show a frame while it is made. Called on the display rank
     // for each composited tile, when its pixels are in the image of the open frame. With the operations of the library,
-    // these are the tiles that have an active pixel. Worker threads, the progress thread or a thread in end() call it,
-    // for several tiles at once, while other pixels of the image are still being written. It must be quick. An
-    // exception makes the frame fail. For tiles whose owners are on the display rank's node, all calls may come at the
-    // end of the frame.
+    // these are the tiles that have an active pixel. Worker threads call it, and your own threads in setTile(), poll(),
+    // loops and calls that wait, such as end(); for several tiles at once, while other pixels of the image are still
+    // being written. It must be quick. An exception makes the frame fail. For tiles whose owners are on the display
+    // rank's node, all calls may come at the end of the frame.
     TileCallback onTile{};
     // After this time in end(), ranks check whether a message is still under way; they check again at growing
     // intervals. If no message is, the frame fails with ErrorKind::MissingInput. 1 ms to 24 days. A short time costs a

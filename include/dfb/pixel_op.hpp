@@ -11,7 +11,9 @@
 //                                                are no side effects: then background tiles need not be processed
 //                                                one by one nor travel. Default false.
 //   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
-//   void newFrame(const FrameData&);             called in begin(), once a frame on every rank, if there is a FrameData
+//   void newFrame(const FrameData&);             called in begin(), once a frame on every rank, if there is one;
+//   without
+//                                                a FrameData it takes a const NoFrameData&
 #pragma once
 
 #include <dfb/base/detect.hpp>

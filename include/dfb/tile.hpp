@@ -24,7 +24,7 @@ struct TileHeader {
     int pass = 0;             // passes are composited each by itself, then averaged
     int generation = 0;       // level in the tile's dependency tree
     int children = 0;         // how many inputs of generation + 1 this one announces
-    std::uint32_t source = 0; // brick id; the rank where there are no bricks
+    std::uint32_t source = 0; // brick id, or another number; where there are no bricks, the rank
     std::uint16_t part = 0;   // to tell apart several inputs of one source
     int sample = 0;           // sample number over all frames that accumulate: the index to seed with; set by start
 };

@@ -273,7 +273,7 @@ struct LensSample {
 class PerspectiveCamera {
 public:
     // Looks from `eye` to `target`; `fovY` is the vertical angle of view in degrees. Throws InvalidArgument if the two
-    // coincide, `up` is along the view, or the angle is not in (0, 180).
+    // coincide, `up` is 0 or along the view, the angle is not in (0, 180), or a number is not finite.
     PerspectiveCamera(const Vec3& eye, const Vec3& target, const Vec3& up, float fovY)
         : PerspectiveCamera(detail::poseOf(eye, target - eye, up, fovY))
     {
