@@ -2,9 +2,8 @@
 # sh tests/sanitizers.sh [--brief] [PRESET...]
 # Installs what is missing, builds the presets "asan", "tsan" and "clang", or those that are named, and runs the
 # library's tests in each. With --brief, for CI,
-#   "asan" leaves out tests with ranks as threads, which "tsan" runs; 2 and 7 ranks over MPI, as it runs 3; and the
-# check for
-#     uses of a function's variables after its end, which takes most of the time;
+#   "asan" leaves out tests with ranks as threads, which "tsan" runs; 2 and 7 ranks over MPI, as it runs 3; and the check
+#     for uses of a function's variables after its end, which takes most of the time;
 #   "tsan" leaves out tests with a single thread, which "asan" runs: fuzz targets and the longer unit tests;
 #   both leave out instruction sets, numbers and steps of credit, which take them minutes.
 set -u

@@ -12,8 +12,15 @@ copy=$source/build/icet-faults
 adapter=$copy/examples/adapters/icet
 cases=200
 isCheck=
-[ "${1:-}" != --cases ] || cases=$2
-[ "${1:-}" != --check ] || isCheck=1
+case "${1:-}${2:+ N}" in
+'') ;;
+'--cases N') cases=$2 ;;
+--check) isCheck=1 ;;
+*)
+    echo "usage: sh tests/icet/faults.sh [--cases N | --check]" >&2
+    exit 2
+    ;;
+esac
 
 build() {
     cmake --build "$copy/build" --target dfb_icet test_icet_differential >"$copy/build.log" 2>&1

@@ -7,8 +7,9 @@
 //   mpirun -n 1 mpi_session too_early    the same while there is a framebuffer: the process ends and says why
 //   mpirun -n 1 mpi_session open_frame   a framebuffer is destroyed before a frame of it: so it does then
 //   mpirun -n 3 mpi_session exception    rank 1 leaves with an exception: the job ends, with code 1
+//   mpirun -n 3 mpi_session exception_frame   the same between two frames
 //   mpirun -n 3 mpi_session give_up      rank 1 cannot go on, and the others neither: the same
-// With a file as second argument, the last two append to it what each rank caught: a launcher may drop what a rank
+// With a file as second argument, the last three append to it what each rank caught: a launcher may drop what a rank
 // prints just before its job ends. Returns 0 if all is well.
 #include <dfb/dfb.hpp>
 

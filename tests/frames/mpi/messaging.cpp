@@ -445,6 +445,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
                     scene::renderBrick(s, brick, *tile);
                     frame.setTile(*tile);
                 }
+        MPI_Barrier(MPI_COMM_WORLD); // all inputs were sent
         if (rank == 0) {
             CHECK(inputs == 0); // it has not polled
             int expected = 0;

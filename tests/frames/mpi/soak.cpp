@@ -13,6 +13,8 @@
 #include <string>
 #include <vector>
 
+#include <unistd.h>
+
 namespace soak_cases {
 
 // Sanitizers keep freed memory, to find code that uses it.
@@ -49,7 +51,7 @@ struct Holdings {
         h.files = count("/proc/self/fd");
         long pages = 0, resident = 0;
         std::ifstream("/proc/self/statm") >> pages >> resident;
-        h.megabytes = static_cast<double>(resident) * 4096 / (1 << 20);
+        h.megabytes = static_cast<double>(resident * sysconf(_SC_PAGESIZE)) / (1 << 20);
         return h;
     }
 };
