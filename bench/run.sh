@@ -31,7 +31,7 @@ while [ $# -gt 0 ]; do
 done
 jobs=$(sh cmake/jobs.sh)
 commit=$(git rev-parse --short HEAD 2>/dev/null || echo unknown)
-results=bench/results
+results=build/bench_results # moved to bench/results at the end
 bench=build/release/bench
 
 sh cmake/install_packages.sh bench
@@ -40,8 +40,23 @@ cmake --preset release -DDFB_BUILD_BENCH=ON
 cmake --build --preset release --parallel "$jobs" --target bench_error_time bench_compositing bench_overlap \
     bench_scaling bench_skip bench_paper bench_kernels
 
+# The launcher of the MPI with which the programs were built.
+mpiexec=$(sed -n 's/^MPIEXEC_EXECUTABLE:[A-Z]*=//p' build/release/CMakeCache.txt)
+flags=
+if "$mpiexec" --version 2>&1 | grep -E 'Open MPI|OpenRTE|PRRTE' >/dev/null; then
+    flags="--oversubscribe --bind-to none"
+    [ "$(id -u)" -ne 0 ] || flags="$flags --allow-run-as-root"
+fi
+# on_ranks N PROGRAM ARGUMENT...
+on_ranks() {
+    count=$1
+    shift
+    # shellcheck disable=SC2086 # one word per flag
+    "$mpiexec" $flags -n "$count" "$@"
+}
+
+rm -rf "$results"
 mkdir -p "$results"
-find "$results" -type f ! -name messaging.md ! -name gather.md -exec rm -f {} +
 for name in kernels compositing overlap paper scaling skip; do
     printf '# Results of bench_%s\n\n' "$name" >"$results/$name.md"
 done
@@ -49,7 +64,7 @@ done
 "$bench"/bench_kernels --json "$results/kernels.json" --table "$results/kernels.md"
 
 for ranks in 4 8; do
-    mpiexec -n "$ranks" "$bench"/bench_error_time --frames "$frames" --commit "$commit" \
+    on_ranks "$ranks" "$bench"/bench_error_time --frames "$frames" --commit "$commit" \
         --json "$results/error_time.json" --table "$results/error_time.$ranks.md"
 done
 python=python3
@@ -59,32 +74,32 @@ python=python3
 
 # The measurement at one size tells most; the others show whether it holds in general.
 for ranks in 2 3 4 8 16; do
-    mpiexec -n "$ranks" "$bench"/bench_compositing --scene all --size 1024x1024 \
+    on_ranks "$ranks" "$bench"/bench_compositing --scene all --size 1024x1024 \
         --frames "$compositing_frames" --commit "$commit" \
         --json "$results/compositing.json" --table "$results/compositing.md"
 done
 for ranks in 2 4 8; do
     for way in --moving --reader; do
-        mpiexec -n "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 1024x1024,2048x2048 $way \
+        on_ranks "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 1024x1024,2048x2048 $way \
             --only "$main_rows" --frames "$compositing_frames" --commit "$commit" \
             --json "$results/compositing.json" --table "$results/compositing.md"
     done
-    mpiexec -n "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 2048x2048,4096x4096 \
+    on_ranks "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 2048x2048,4096x4096 \
         --only "$main_rows" \
         --frames 5 --commit "$commit" --json "$results/compositing.json" --table "$results/compositing.md"
 done
 
 for ranks in 2 4 8; do
-    mpiexec -n "$ranks" "$bench"/bench_overlap --size 256x256,512x512,1024x1024 --views "$views" \
+    on_ranks "$ranks" "$bench"/bench_overlap --size 256x256,512x512,1024x1024 --views "$views" \
         --commit "$commit" --json "$results/overlap.json" --table "$results/overlap.md"
-    mpiexec -n "$ranks" "$bench"/bench_overlap --size 512x512 --views "$views" --in-a-row 7 \
+    on_ranks "$ranks" "$bench"/bench_overlap --size 512x512 --views "$views" --in-a-row 7 \
         --commit "$commit" --json "$results/overlap.json"
 done
 
 for figure in 6 7 8 9 10; do
     ranks=1,2,4,8
     [ "$figure" -ne 10 ] || ranks=4,8
-    mpiexec -n 8 "$bench"/bench_paper --figure "$figure" --ranks "$ranks" --size "$paper_sizes" \
+    on_ranks 8 "$bench"/bench_paper --figure "$figure" --ranks "$ranks" --size "$paper_sizes" \
         --views "$paper_views" --check 1 --commit "$commit" \
         --json "$results/paper.json" --svg "$results/paper.$figure.svg" --table "$results/paper.md"
 done
@@ -102,4 +117,7 @@ if [ -n "$launcher" ]; then
 else
     echo "run.sh: no --launcher: nothing was measured over a network"
 fi
+mkdir -p bench/results
+find bench/results -type f ! -name messaging.md ! -name gather.md -exec rm -f {} +
+cp "$results"/* bench/results
 exit "$status"

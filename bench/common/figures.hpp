@@ -33,8 +33,8 @@ inline double threadCpuSeconds() { return cpuSeconds(CLOCK_THREAD_CPUTIME_ID); }
 
 // ---- figures and tables
 
-// The median absolute deviation: half of the samples are no farther than that from the median. A quarter of the samples
-// is below `low`, a quarter above `high`.
+// The median absolute deviation: half of the samples are no farther than that from the median. At most a quarter of the
+// samples is below `low`, at most a quarter above `high`.
 struct Figure {
     double median = 0, deviation = 0;
     std::size_t count = 0;
@@ -89,6 +89,15 @@ inline std::string byteText(std::size_t byteCount)
                                                                     : std::to_string(byteCount) + " B";
 }
 
+// Throws std::runtime_error if it cannot be written.
+inline void appendTo(const std::string& path, const std::string& what)
+{
+    std::ofstream file(path, std::ios::app);
+    file << what;
+    if (!file.flush())
+        throw std::runtime_error("cannot write " + path);
+}
+
 class Table {
 public:
     explicit Table(std::vector<std::string> head) : rows_{std::move(head)} {}
@@ -123,10 +132,7 @@ public:
     // Appends the table to a file.
     void appendTo(const std::string& path, const std::string& title) const
     {
-        std::ofstream file(path, std::ios::app);
-        file << '\n' << title << "\n\n" << text();
-        if (!file.flush())
-            throw std::runtime_error("cannot write " + path);
+        bench::appendTo(path, '\n' + title + "\n\n" + text());
     }
 
 private:

@@ -30,7 +30,6 @@ public:
     // Collective, as is all that it does. The communicator remains the caller's.
     explicit FrameTimer(MPI_Comm comm) : comm_(comm)
     {
-        MPI_Comm_rank(comm, &rank_);
         char own[MPI_MAX_PROCESSOR_NAME] = {}, first[MPI_MAX_PROCESSOR_NAME] = {};
         int length = 0;
         MPI_Get_processor_name(own, &length);
@@ -66,10 +65,10 @@ public:
         return t;
     }
 
-private:
-    // The time of rank 0's clock.
+    // The time of rank 0's clock, as far as this rank knew it at the last synchronize().
     double clock() const { return now() + offset_; }
 
+    // Collective. Does nothing where all ranks are on one node.
     void synchronize()
     {
         constexpr int rounds = 12, tag = 77;
@@ -98,8 +97,8 @@ private:
         }
     }
 
+private:
     MPI_Comm comm_;
-    int rank_ = 0;
     bool isElsewhere_ = false;
     std::vector<int> elsewhere_; // on rank 0: the ranks that ask
     double offset_ = 0;          // to rank 0's clock

@@ -47,11 +47,10 @@ struct Result {
 
 inline void appendJson(const std::string& path, const std::vector<Result>& results)
 {
-    std::ofstream file(path, std::ios::app);
+    std::string lines;
     for (const Result& r : results)
-        file << r.json() << '\n';
-    if (!file.flush())
-        throw std::runtime_error("cannot write " + path);
+        lines += r.json() + '\n';
+    appendTo(path, lines);
 }
 
 // Whether a file has a table, to which lines can be added. False, too, if there is no file.

@@ -344,24 +344,21 @@ private:
     // With a head, if the file has no table yet.
     void addToTable(const Best& best, const std::array<std::string, 4>& what) const
     {
-        const bool isFirst = !bench::hasTable(o_.table);
-        std::ofstream file(o_.table, std::ios::app);
-        if (isFirst)
-            file << "| scene | size | ranks | to | memory alone [ms] | dfb float32 [ms] | dfb defaults [ms] | dfb "
+        std::string lines;
+        if (!bench::hasTable(o_.table))
+            lines = "| scene | size | ranks | to | memory alone [ms] | dfb float32 [ms] | dfb defaults [ms] | dfb "
                     "within a level [ms] | "
                     "IceT float [ms] "
                     "| IceT ubyte [ms] | dfb float32 : IceT float | : ubyte | dfb within a level : IceT float "
                     "| : ubyte |\n|---|---|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n";
         for (const std::string& text : what)
-            file << "| " << text << ' ';
+            lines += "| " + text + ' ';
         for (const Result* r : {best.limit, best.exact, best.defaults, best.oneLevel, best.icetFloat, best.icetUbyte})
-            file << "| " << timeText(r) << ' ';
+            lines += "| " + timeText(r) + ' ';
         for (const Result* mine : {best.exact, best.oneLevel})
             for (const Result* peer : {best.icetFloat, best.icetUbyte})
-                file << "| " << ratios(mine, peer) << ' ';
-        file << "|\n";
-        if (!file.flush())
-            throw std::runtime_error("cannot write " + o_.table);
+                lines += "| " + ratios(mine, peer) + ' ';
+        bench::appendTo(o_.table, lines + "|\n");
     }
 
     MPI_Comm comm_;

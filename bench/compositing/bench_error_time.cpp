@@ -182,9 +182,10 @@ public:
             add(name.str(), 256, threshold);
         }
         const int frames = std::max(3, o_.frames / 4);
+        bench::FrameTimer timer(comm_);
         for (System& s : systems) {
             for (int frame = -1; frame < frames; ++frame)
-                bench::timeFrame(comm_, s, frame >= 0);
+                bench::timeFrame(comm_, timer, s, frame >= 0);
             bench::takeResult(comm_, s, exact); // before the next one's image is in the framebuffer
             describe(s, "noise", width, height);
             if (rank_ == 0)
@@ -281,7 +282,7 @@ public:
         if (!o_.json.empty())
             bench::appendJson(o_.json, results);
         if (!o_.table.empty())
-            std::ofstream(o_.table, std::ios::app) << chosen.str();
+            bench::appendTo(o_.table, chosen.str());
     }
 
 private:

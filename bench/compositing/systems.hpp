@@ -4,6 +4,7 @@
 
 #include "brick_images.hpp"
 #include "direct_send.hpp"
+#include "frame_times.hpp"
 #include "memory_limit.hpp"
 #include "radix_k.hpp"
 #include "results.hpp"
@@ -510,21 +511,22 @@ inline std::uint64_t readAll(const void* image, std::size_t byteCount)
 }
 
 // Collective: one frame, from when the first rank begins to when rank 0 has the image; or, if `imagePixels` is not 0,
-// has read it.
-inline void timeFrame(MPI_Comm comm, System& s, bool counts, std::size_t imagePixels = 0)
+// has read it. `timer`: of `comm`.
+inline void timeFrame(MPI_Comm comm, FrameTimer& timer, System& s, bool counts, std::size_t imagePixels = 0)
 {
     int rank = 0;
     MPI_Comm_rank(comm, &rank);
     const std::size_t readPixels = rank == 0 ? imagePixels : 0;
+    timer.synchronize();
     meet(comm);
-    const double start = now(), cpuBefore = processCpuSeconds(), yieldedBefore = yieldedSeconds();
+    const double start = timer.clock(), cpuBefore = processCpuSeconds(), yieldedBefore = yieldedSeconds();
     s.compositor.frame();
     static volatile std::uint64_t seen = 0;
     if (readPixels > 0 && s.compositor.floats && s.compositor.floats())
         seen = seen ^ readAll(s.compositor.floats(), 16 * readPixels);
     if (readPixels > 0 && s.compositor.bytes && s.compositor.bytes())
         seen = seen ^ readAll(s.compositor.bytes(), 4 * readPixels);
-    const double end = now(), cpu = processCpuSeconds() - cpuBefore, yielded = yieldedSeconds() - yieldedBefore;
+    const double end = timer.clock(), cpu = processCpuSeconds() - cpuBefore, yielded = yieldedSeconds() - yieldedBefore;
     const double first = reduce(comm, start, MPI_MIN);
     const double cpuOfAll = reduce(comm, cpu, MPI_SUM), yieldedByAll = reduce(comm, yielded, MPI_SUM);
     if (!counts)
@@ -572,12 +574,13 @@ inline void measureInTurns(Inputs& inputs, std::vector<System>& systems, int fra
     const std::size_t pixels = inputs.isReadInside ? inputs.image().depth.size() : 0;
     for (System& s : systems)
         s.compositor = s.start();
+    FrameTimer timer(comm);
     const auto views = static_cast<int>(inputs.views.size());
     const int all = (frames + views - 1) / views * views; // so that the last is of the first view
     for (int frame = -views; frame <= all; ++frame) {     // before 0: touches memory
         inputs.frame = static_cast<std::size_t>(frame + views);
         for (std::size_t i = 0; i < systems.size(); ++i)
-            timeFrame(comm, systems[(i + inputs.frame) % systems.size()], frame > 0, pixels);
+            timeFrame(comm, timer, systems[(i + inputs.frame) % systems.size()], frame > 0, pixels);
     }
     for (System& s : systems)
         takeResult(comm, s, exact);

@@ -151,12 +151,8 @@ inline void writeMeasurements(const std::vector<Measurement>& all, const std::st
     }
     std::printf("\n%s\n", table.c_str());
     const auto append = [](const std::string& path, const std::string& what) {
-        if (path.empty())
-            return;
-        std::ofstream file(path, std::ios::app);
-        file << what;
-        if (!file.flush())
-            throw std::runtime_error("cannot write " + path);
+        if (!path.empty())
+            bench::appendTo(path, what);
     };
     std::string lines;
     for (const Measurement& m : all)

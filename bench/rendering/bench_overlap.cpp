@@ -56,10 +56,7 @@ public:
         }
 #endif
         systems.erase(std::remove_if(systems.begin(), systems.end(),
-                                     [&](const MarchedSystem& s) {
-                                         return s.image && !o_.only.empty()
-                                                && s.name.find(o_.only) == std::string::npos;
-                                     }),
+                                     [&](const MarchedSystem& s) { return s.image && !isWanted(s.name); }),
                       systems.end());
         bench::FrameTimer timer(comm_);
         double largest = 0; // difference of two images
@@ -72,8 +69,8 @@ public:
                 if (v > 0)
                     s.times.push_back(t);
             }
-            const float *ours = systems.size() > 1 ? systems[1].image() : nullptr,
-                        *theirs = systems.size() > 1 ? systems.back().image() : nullptr;
+            const float *ours = systems.size() > 2 ? systems[1].image() : nullptr,
+                        *theirs = systems.size() > 2 ? systems.back().image() : nullptr;
             const std::size_t values = 4 * static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
             for (std::size_t i = 0; ours && theirs && i < values; ++i)
                 largest = std::max(largest, std::abs(static_cast<double>(ours[i]) - static_cast<double>(theirs[i])));
@@ -211,10 +208,14 @@ private:
             }
         }
         const std::string size = std::to_string(width) + 'x' + std::to_string(height);
-        table.print(size + ", " + std::to_string(size_) + " ranks, " + std::to_string(o_.views)
-                    + " views; images of dfb "
-                      "and IceT differ by "
-                    + bench::text(largest) + " at most");
+        std::string title = size + ", " + std::to_string(size_) + " ranks, " + std::to_string(o_.views) + " views";
+        if (systems.size() > 2) {
+            char difference[32];
+            std::snprintf(difference, sizeof difference, "%.2g", largest);
+            title += "; images of " + systems[1].name + " and " + systems.back().name + " differ by " + difference
+                     + " at most";
+        }
+        table.print(title);
         if (!o_.json.empty())
             bench::appendJson(o_.json, results);
         std::size_t best = 0; // of the peer's
@@ -238,8 +239,16 @@ private:
         std::printf("\n%s%s", head, line.c_str());
         if (o_.table.empty())
             return;
-        const bool isFirst = !bench::hasTable(o_.table);
-        std::ofstream(o_.table, std::ios::app) << (isFirst ? head : "") << line;
+        bench::appendTo(o_.table, (bench::hasTable(o_.table) ? "" : head) + line);
+    }
+
+    // Whether a system was asked for by a part of its name.
+    bool isWanted(const std::string& name) const
+    {
+        const std::vector<std::string> parts = bench::partsOf(o_.only, '|');
+        return parts.empty() || std::any_of(parts.begin(), parts.end(), [&](const std::string& part) {
+                   return name.find(part) != std::string::npos;
+               });
     }
 
     MPI_Comm comm_;
@@ -256,7 +265,9 @@ Options optionsOf(int argc, char** argv)
         "usage: mpirun -n RANKS bench_overlap [--size WxH,...] [--views N] [--json FILE] [--table FILE] "
         "[--commit ID] [--only TEXT] [--trace FILE] [--in-a-row TIMES]\n"
         "  --only TEXT       only systems whose name has TEXT; several texts with | between them\n"
-        "  --in-a-row TIMES  renders all views so often without a pause, and gives the frames per second\n"
+        "  --in-a-row TIMES  renders all views so often without a pause, and gives the frames per second, of all "
+        "systems;\n"
+        "                    --table and --trace have no effect then\n"
         "  --commit ID       is written to the JSON file",
         {{"--size", bench::readSizes(o.sizes)},
          {"--views", [&o](const std::string& value) { return (o.views = std::atoi(value.c_str())) > 0; }},

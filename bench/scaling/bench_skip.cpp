@@ -1,6 +1,6 @@
 // The work that a frame skips: its cost as less of the image is active, and the work that is left out altogether. Each
 // claim is a line: what was measured, its limit, and whether it holds. 4 ranks are threads of this process; no MPI.
-//   bench_skip [--size 1024x1024] [--frames 11] [--quick] [--json FILE] [--svg FILE] [--table FILE] [--commit ID]
+//   bench_skip [--size 1024x1024] [--frames 12] [--quick] [--json FILE] [--svg FILE] [--table FILE] [--commit ID]
 //   bench_skip --frames-of full|empty [--frames N] [--size ...] [--trace FILE]
 //                                                       N frames of that and nothing else, for profilers
 // The exit status is 1 if a claim of counts does not hold. Times are shown, as a machine may have other work.
