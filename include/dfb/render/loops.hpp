@@ -208,8 +208,8 @@ public:
         }
     }
 
-    // What the camera threw in set(), or null. begin() has to get it, as inputs of other ranks may be here already:
-    // without the order, they are not what this rank expects.
+    // The exception that the camera threw in set(), or null. begin() has to get it, as inputs of other ranks may be
+    // here already: without the order, they are not what this rank expects.
     const std::exception_ptr& failure() const noexcept { return failure_; }
 
 private:
