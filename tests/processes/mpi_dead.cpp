@@ -73,14 +73,24 @@ bool othersTold(const Run& run)
     return allTold(others);
 }
 
+// The other ranks read the time of the loss from a file. The clock is that of the host.
 void die(const Run& run)
 {
+    std::ofstream(run.folder + "/lost") << Clock::now().time_since_epoch().count();
     if (run.how == "kill")
         raise(SIGKILL);
     else if (run.how == "exit")
         _exit(0);
     else
         raise(SIGSTOP);
+}
+
+// When the rank was lost, or `start` if that is later.
+Clock::time_point timeOfLoss(Clock::time_point start, const Run& run)
+{
+    Clock::rep ticks = 0;
+    std::ifstream(run.folder + "/lost") >> ticks;
+    return std::max(start, Clock::time_point(Clock::duration(ticks)));
 }
 
 void emptyFrame(
@@ -193,7 +203,7 @@ void runRank(const Run& run, int& argc, char**& argv)
             text = e.what();
             lost = e.info().rank;
         }
-        toldMs = msSince(start);
+        toldMs = msSince(timeOfLoss(start, run));
         start = Clock::now();
     }
     const double goneMs = msSince(start);
