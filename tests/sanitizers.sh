@@ -4,7 +4,8 @@
 # library's tests in each. With --brief, for CI,
 #   "asan" leaves out tests with ranks as threads, which "tsan" runs; 2 and 7 ranks over MPI, as it runs 3; and the check
 #     for uses of a function's variables after its end, which takes most of the time;
-#   "tsan" leaves out tests with a single thread, which "asan" runs: fuzz targets and the longer unit tests;
+#   "tsan" leaves out tests with a single thread, which "asan" runs: fuzz targets and the longer unit tests; and runs
+#     tests of whole frames on 1 and 4 ranks, not on 2, 3 and 7;
 #   both leave out instruction sets, numbers and steps of credit, which take them minutes.
 set -u
 
@@ -32,7 +33,7 @@ run() {
         fuzz='control|finished|fragment|packet|readers|tracker'
         unit='blend_kernels|dependency_tracker|fragment_message|levels|quiescence|sparse_planes|tile_ops|visibility|wire_format'
         without="^test_(odr|stress|isa_[a-z_]+|fuzz_($fuzz))\$"
-        tests="^($long|unit[.]($unit)\$|fuzz[.]($fuzz)\$)"
+        tests="^($long|unit[.]($unit)\$|fuzz[.]($fuzz)\$)" test_preset=tsan-brief
     fi
     targets=$(cmake --build --preset "$1" --target help | sed -nE 's/^((test|mpi)_[a-z_]+): phony$/\1/p' |
         grep -Ev "$without") || return

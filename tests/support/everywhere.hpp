@@ -1,4 +1,4 @@
-// Everywhere: runs a case on 1, 2, 3, 4 and 7 ranks in one process (test_inproc), or on all ranks of MPI and on one
+// Everywhere: runs a case on several numbers of ranks in one process (test_inproc), or on all ranks of MPI and on one
 // rank in this process (test_mpi). All images must be the same bit for bit.
 //
 // A case has   template <class Transport> static Result run(const typename Transport::Communicator&);

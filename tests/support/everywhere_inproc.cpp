@@ -1,10 +1,25 @@
-// Runs the cases of everywhere.hpp on 1, 2, 3, 4 and 7 ranks in this process.
+// Runs the cases of everywhere.hpp on 1, 2, 3, 4 and 7 ranks in this process, or on the numbers of ranks that the
+// environment's DFB_TEST_RANKS names, such as "1 4".
 #include "everywhere.hpp"
 #include "undisturbed.hpp"
 
 #include <cstddef>
+#include <cstdlib>
 #include <future>
+#include <iterator>
+#include <sstream>
 #include <vector>
+
+namespace {
+
+std::vector<int> rankCounts()
+{
+    const char* chosen = std::getenv("DFB_TEST_RANKS");
+    std::istringstream text(chosen ? chosen : "1 2 3 4 7");
+    return {std::istream_iterator<int>(text), {}};
+}
+
+} // namespace
 
 void frame_cases::runEverywhere(Run run, bool atOnce)
 {
@@ -13,13 +28,14 @@ void frame_cases::runEverywhere(Run run, bool atOnce)
     atOnce = false; // with it, a case that mostly waits mostly computes instead
 #endif
 #endif
-    const std::vector<int> counts{1, 2, 3, 4, 7};
+    const std::vector<int> counts = rankCounts();
+    REQUIRE(!counts.empty());
     const auto again = [](bool stoodStill, const auto& result) { return stoodStill && !result.get().wrong.empty(); };
     std::vector<std::future<Result>> results;
     for (const int ranks : counts)
         results.push_back(std::async(atOnce ? std::launch::async : std::launch::deferred,
                                      [=] { return undisturbed([=] { return inProcess(run, ranks); }, again); }));
-    std::uint64_t hash = 0; // of the run with one rank
+    std::uint64_t hash = 0; // of the first run
     for (std::size_t i = 0; i < counts.size(); ++i) {
         const Result result = results[i].get();
         if (i == 0)
