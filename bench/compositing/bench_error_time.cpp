@@ -6,6 +6,8 @@
 // --trace: of dfb's first system.
 #include "systems.hpp"
 
+#include <dfb/blend/compositing.hpp>
+
 #include <fstream>
 #include <memory>
 #include <sstream>

@@ -2,8 +2,8 @@
 // its own, a CallerExecutor on the threads that call it, a TbbExecutor (tbb_executor.hpp) in a oneTBB arena of its own.
 #pragma once
 
-#include <dfb/base/cpu.hpp>
 #include <dfb/base/fifo.hpp>
+#include <dfb/base/processors.hpp>
 #include <dfb/version.hpp>
 
 #include <atomic>

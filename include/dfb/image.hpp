@@ -2,12 +2,10 @@
 // pixels to those formats.
 #pragma once
 
-#include <dfb/base/cpu.hpp>
 #include <dfb/buffer.hpp>
 #include <dfb/channels.hpp>
 #include <dfb/compiled.hpp>
 #include <dfb/error.hpp>
-#include <dfb/levels.hpp>
 
 #include <algorithm>
 #include <array>
@@ -18,10 +16,6 @@
 #include <numeric>
 #include <string>
 #include <vector>
-
-#if defined(__SSE2__)
-#include <immintrin.h>
-#endif
 
 DFB_NAMESPACE_BEGIN
 
@@ -70,79 +64,20 @@ inline std::size_t bytesPerPixel(OutputFormat format) noexcept
     return format == OutputFormat::None ? 0 : format == OutputFormat::RGBA32F ? 16 : 4;
 }
 
-namespace detail {
-
-template <class Real>
-DFB_INLINE void toFloats(const Real* values, int count, float* out) noexcept
-{
-    for (int i = 0; i < count; ++i)
-        out[i] = static_cast<float>(values[i]);
-}
-
-// A float -0 becomes 0.
-DFB_INLINE void copyFloats(const float* values, int count, float* out) noexcept
-{
-    for (int i = 0; i < count; ++i)
-        out[i] = values[i] + 0.0f;
-}
-
-// A pixel as four floats; a float -0 becomes 0.
-#if defined(__SSE2__)
-inline __m128 pixelOf(const double* rgba) noexcept
-{
-    return _mm_movelh_ps(_mm_cvtpd_ps(_mm_loadu_pd(rgba)), _mm_cvtpd_ps(_mm_loadu_pd(rgba + 2)));
-}
-inline __m128 pixelOf(const float* rgba) noexcept { return _mm_add_ps(_mm_loadu_ps(rgba), _mm_setzero_ps()); }
-#endif
-
-// Stores float pixels past the cache, in whole cache lines: this thread does not read `out` soon, so its lines need not
-// be fetched. Call storesAreDone() before other threads learn of the pixels. Returns how many pixels were stored, from
-// the first on. The caller must store the others.
-template <class Real>
-int streamPixels([[maybe_unused]] const Real* rgba, [[maybe_unused]] int count, [[maybe_unused]] float* out) noexcept
-{
-    int stored = 0;
-#if defined(__SSE2__)
-    constexpr std::uintptr_t line = 64;
-    const auto address = reinterpret_cast<std::uintptr_t>(out);
-    if (address % 16 != 0 || count < 16)
-        return 0;
-    for (; (address + 16 * static_cast<std::uintptr_t>(stored)) % line != 0; ++stored)
-        _mm_store_ps(out + 4 * stored, pixelOf(rgba + 4 * stored));
-    for (; stored + 4 <= count; stored += 4)
-        for (int i = 4 * stored; i < 4 * stored + 16; i += 4)
-            _mm_stream_ps(out + i, pixelOf(rgba + i));
-#endif
-    return stored;
-}
-inline void storesAreDone() noexcept
-{
-#if defined(__SSE2__)
-    _mm_sfence();
-#endif
-}
-
-} // namespace detail
-
 // Converts `count` linear premultiplied RGBA pixels, double or float, to `format`, and writes bytesPerPixel(format)
 // bytes each to `out`, rounded to nearest. `out` must have room for them and not overlap `rgba`; for RGBA32F it is
 // aligned to floats. Any thread. Returns the largest rounding distance in 8-bit levels, 0 to 1/2; 1/2 is a tie. It may
 // be up to 2^-15 too large. An sRGB colour next to a level's boundary counts as a tie; other sRGB colours do not count.
 // 0 for RGBA32F and None.
 template <class Real>
-double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out)
-{
-    auto* bytes = reinterpret_cast<std::uint8_t*>(out);
-    switch (format) {
-    case OutputFormat::None: break;
-    case OutputFormat::RGBA8: return detail::pixelsToLevels<false>(rgba, count, bytes);
-    case OutputFormat::SRGBA8: return detail::pixelsToLevels<true>(rgba, count, bytes);
-    case OutputFormat::RGBA32F:
-        detail::fastest<detail::toFloats<Real>>(rgba, 4 * count, reinterpret_cast<float*>(out));
-        break;
-    }
-    return 0;
-}
+double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out);
+
+// convertPixels() with dithered colour, if the format has 8 bits; (x, y) is the place of the first pixel in the image.
+// Alpha is rounded, not dithered. A colour value that is at most alpha gets no level above the one that alpha would get
+// if it were a colour, with ties going to the lower level. So in RGBA8 it stays at most alpha. This lowers it by half a
+// level at most. Returns the largest rounding distance of alpha, as convertPixels() does.
+template <class Real>
+double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int y, std::byte* out);
 
 // A whole image, row-major, without padding. Row 0 is the top row, or the lowest one after
 // ImageCompositor::setBottomUp(true). image() is empty on ranks other than the display rank, and with
@@ -267,94 +202,28 @@ private:
 // file cannot be written, which may leave a part of it.
 DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image);
 
+DFB_NAMESPACE_END
+
 #if DFB_HAS_BODIES
-DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image)
+#include <dfb/levels.hpp>
+
+DFB_NAMESPACE_BEGIN
+
+template <class Real>
+double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out)
 {
-    if (image.empty())
-        detail::failArgument("no image to write to %s: only the display rank has one", path.c_str());
-    const auto width = static_cast<std::size_t>(image.width()), height = static_cast<std::size_t>(image.height());
-    const bool isFloat = image.format() == OutputFormat::RGBA32F;
-    std::vector<std::uint8_t> converted(isFloat ? 4 * width : 0), row(3 * width);
-    std::FILE* file = std::fopen(path.c_str(), "wb");
-    bool good = file && std::fprintf(file, "P6 %zu %zu 255\n", width, height) > 0;
-    for (std::size_t y = 0; good && y < height; ++y) {
-        if (isFloat)
-            convertPixels(image.rgba32f() + 4 * width * y, image.width(), OutputFormat::SRGBA8,
-                          reinterpret_cast<std::byte*>(converted.data()));
-        const std::uint8_t* rgba = isFloat ? converted.data() : image.rgba8() + 4 * width * y;
-        for (std::size_t x = 0; x < width; ++x)
-            std::copy_n(rgba + 4 * x, 3, row.data() + 3 * x);
-        good = std::fwrite(row.data(), 1, row.size(), file) == row.size();
+    auto* bytes = reinterpret_cast<std::uint8_t*>(out);
+    switch (format) {
+    case OutputFormat::None: break;
+    case OutputFormat::RGBA8: return detail::pixelsToLevels<false>(rgba, count, bytes);
+    case OutputFormat::SRGBA8: return detail::pixelsToLevels<true>(rgba, count, bytes);
+    case OutputFormat::RGBA32F:
+        detail::fastest<detail::toFloats<Real>>(rgba, 4 * count, reinterpret_cast<float*>(out));
+        break;
     }
-    if (file && std::fclose(file) != 0)
-        good = false;
-    if (!good)
-        detail::failArgument("cannot write %s", path.c_str());
-}
-#endif
-
-// Dither: conversion to 8 bits that leaves no bands in gradients. Each pixel's place in the image gives a threshold. A
-// value that is farther than this fraction of the way between two levels takes the upper one. So the mean over
-// neighbours can lie between levels.
-//
-// The thresholds are those of B. E. Bayer, "An optimum method for two-level rendition of continuous-tone pictures",
-// IEEE Intl. Conf. on Communications 1973: each of (rank + 1/2) / 64, for ranks 0 to 63, occurs once in any 8x8 pixels.
-// Unlike noise, they keep the mean over every such block, and need only integers. Colours are rounded to float first:
-// then each step is exact, and an image of floats gets the same levels. All channels of a pixel have one threshold, so
-// grey stays grey, and a darker channel does not come out lighter than a brighter one.
-
-namespace detail {
-
-// Returns 0 to 63: the bits of x ^ y and of y in turn, the lowest bits of x and y becoming the highest.
-constexpr int ditherRank(int x, int y) noexcept
-{
-    int rank = 0;
-    for (int bit = 0; bit < 3; ++bit)
-        rank = 4 * rank + 2 * (((x ^ y) >> bit) & 1) + ((y >> bit) & 1);
-    return rank;
+    return 0;
 }
 
-// The level at or below `value`, or the next one if `value` is more than the fraction `threshold` of the way to it.
-// Clamped; NaN gives 0.
-inline int ditherUnorm8(float value, double threshold) noexcept
-{
-    if (!(value > 0.0f))
-        return 0;
-    if (value >= 1.0f)
-        return 255;
-    const double scaled = 255.0 * static_cast<double>(value);
-    const int below = static_cast<int>(scaled);
-    return below + (scaled - below > threshold ? 1 : 0);
-}
-
-// The sRGB level at or below `value`, or the next one if `value` is more than the fraction `threshold` of the way to
-// it. The fraction is measured in linear light, so that the mean is right for an eye that sees no single pixels.
-// Measured in levels, it differs by less than 1/128.
-inline int ditherSrgb8(float value, double threshold)
-{
-    static const std::array<double, 256> light = [] {
-        std::array<double, 256> levels{};
-        for (int k = 0; k < 256; ++k)
-            levels[static_cast<std::size_t>(k)] = srgbInverse(2 * k).high;
-        return levels;
-    }();
-    if (!(value > 0.0f))
-        return 0;
-    if (value >= 1.0f)
-        return 255;
-    const auto linear = static_cast<double>(value);
-    std::size_t below = toSrgb8(linear);
-    below -= linear < light[below] ? 1 : 0;
-    const bool isAbove = linear - light[below] > threshold * (light[below + 1] - light[below]);
-    return static_cast<int>(below) + (isAbove ? 1 : 0);
-}
-
-} // namespace detail
-
-// convertPixels() with dithered colour, if the format has 8 bits; (x, y) is the place of the first pixel in the image.
-// Alpha is rounded, not dithered. A colour value that is at most alpha gets no level above the one that alpha would get
-// if it were a colour, with ties going to the lower level. So in RGBA8 it stays at most alpha. This lowers it by half a
-// level at most. Returns the largest rounding distance of alpha, as convertPixels() does.
 template <class Real>
 double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int y, std::byte* out)
 {
@@ -378,4 +247,36 @@ double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int
     return farthest;
 }
 
+DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image)
+{
+    if (image.empty())
+        detail::failArgument("no image to write to %s: only the display rank has one", path.c_str());
+    const auto width = static_cast<std::size_t>(image.width()), height = static_cast<std::size_t>(image.height());
+    const bool isFloat = image.format() == OutputFormat::RGBA32F;
+    std::vector<std::uint8_t> converted(isFloat ? 4 * width : 0), row(3 * width);
+    std::FILE* file = std::fopen(path.c_str(), "wb");
+    bool good = file && std::fprintf(file, "P6 %zu %zu 255\n", width, height) > 0;
+    for (std::size_t y = 0; good && y < height; ++y) {
+        if (isFloat)
+            convertPixels(image.rgba32f() + 4 * width * y, image.width(), OutputFormat::SRGBA8,
+                          reinterpret_cast<std::byte*>(converted.data()));
+        const std::uint8_t* rgba = isFloat ? converted.data() : image.rgba8() + 4 * width * y;
+        for (std::size_t x = 0; x < width; ++x)
+            std::copy_n(rgba + 4 * x, 3, row.data() + 3 * x);
+        good = std::fwrite(row.data(), 1, row.size(), file) == row.size();
+    }
+    if (file && std::fclose(file) != 0)
+        good = false;
+    if (!good)
+        detail::failArgument("cannot write %s", path.c_str());
+}
+
+DFB_NAMESPACE_END
+#endif
+
+DFB_NAMESPACE_BEGIN
+DFB_COMPILED_TEMPLATE(double convertPixels(const float*, int, OutputFormat, std::byte*));
+DFB_COMPILED_TEMPLATE(double convertPixels(const double*, int, OutputFormat, std::byte*));
+DFB_COMPILED_TEMPLATE(double ditherPixels(const float*, int, OutputFormat, int, int, std::byte*));
+DFB_COMPILED_TEMPLATE(double ditherPixels(const double*, int, OutputFormat, int, int, std::byte*));
 DFB_NAMESPACE_END

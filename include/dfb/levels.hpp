@@ -1,5 +1,5 @@
-// Levels: converts rows of linear values to 8-bit levels, linear or sRGB, correctly rounded. Also returns how near any
-// value came to a tie, so that the caller can decide that value with more digits.
+// Levels: converts rows of linear values to 8-bit levels, linear or sRGB, correctly rounded or dithered, or to floats.
+// Also returns how near any value came to a tie, so that the caller can decide that value with more digits.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -324,6 +324,110 @@ double pixelsToLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
         done = toLevelsAvx2<IsSrgb>(rgba, count, out, farthest);
 #endif
     return std::max(farthest, toLevels<IsSrgb>(rgba + 4 * done, count - done, out + 4 * done));
+}
+
+template <class Real>
+DFB_INLINE void toFloats(const Real* values, int count, float* out) noexcept
+{
+    for (int i = 0; i < count; ++i)
+        out[i] = static_cast<float>(values[i]);
+}
+
+// A float -0 becomes 0.
+DFB_INLINE void copyFloats(const float* values, int count, float* out) noexcept
+{
+    for (int i = 0; i < count; ++i)
+        out[i] = values[i] + 0.0f;
+}
+
+// A pixel as four floats; a float -0 becomes 0.
+#if defined(__SSE2__)
+inline __m128 pixelOf(const double* rgba) noexcept
+{
+    return _mm_movelh_ps(_mm_cvtpd_ps(_mm_loadu_pd(rgba)), _mm_cvtpd_ps(_mm_loadu_pd(rgba + 2)));
+}
+inline __m128 pixelOf(const float* rgba) noexcept { return _mm_add_ps(_mm_loadu_ps(rgba), _mm_setzero_ps()); }
+#endif
+
+// Stores float pixels past the cache, in whole cache lines: this thread does not read `out` soon, so its lines need not
+// be fetched. Call storesAreDone() before other threads learn of the pixels. Returns how many pixels were stored, from
+// the first on. The caller must store the others.
+template <class Real>
+int streamPixels([[maybe_unused]] const Real* rgba, [[maybe_unused]] int count, [[maybe_unused]] float* out) noexcept
+{
+    int stored = 0;
+#if defined(__SSE2__)
+    constexpr std::uintptr_t line = 64;
+    const auto address = reinterpret_cast<std::uintptr_t>(out);
+    if (address % 16 != 0 || count < 16)
+        return 0;
+    for (; (address + 16 * static_cast<std::uintptr_t>(stored)) % line != 0; ++stored)
+        _mm_store_ps(out + 4 * stored, pixelOf(rgba + 4 * stored));
+    for (; stored + 4 <= count; stored += 4)
+        for (int i = 4 * stored; i < 4 * stored + 16; i += 4)
+            _mm_stream_ps(out + i, pixelOf(rgba + i));
+#endif
+    return stored;
+}
+inline void storesAreDone() noexcept
+{
+#if defined(__SSE2__)
+    _mm_sfence();
+#endif
+}
+
+// Dither: conversion to 8 bits that leaves no bands in gradients. Each pixel's place in the image gives a threshold. A
+// value that is farther than this fraction of the way between two levels takes the upper one. So the mean over
+// neighbours can lie between levels.
+//
+// The thresholds are those of B. E. Bayer, "An optimum method for two-level rendition of continuous-tone pictures",
+// IEEE Intl. Conf. on Communications 1973: each of (rank + 1/2) / 64, for ranks 0 to 63, occurs once in any 8x8 pixels.
+// Unlike noise, they keep the mean over every such block, and need only integers. Colours are rounded to float first:
+// then each step is exact, and an image of floats gets the same levels. All channels of a pixel have one threshold, so
+// grey stays grey, and a darker channel does not come out lighter than a brighter one.
+
+// Returns 0 to 63: the bits of x ^ y and of y in turn, the lowest bits of x and y becoming the highest.
+constexpr int ditherRank(int x, int y) noexcept
+{
+    int rank = 0;
+    for (int bit = 0; bit < 3; ++bit)
+        rank = 4 * rank + 2 * (((x ^ y) >> bit) & 1) + ((y >> bit) & 1);
+    return rank;
+}
+
+// The level at or below `value`, or the next one if `value` is more than the fraction `threshold` of the way to it.
+// Clamped; NaN gives 0.
+inline int ditherUnorm8(float value, double threshold) noexcept
+{
+    if (!(value > 0.0f))
+        return 0;
+    if (value >= 1.0f)
+        return 255;
+    const double scaled = 255.0 * static_cast<double>(value);
+    const int below = static_cast<int>(scaled);
+    return below + (scaled - below > threshold ? 1 : 0);
+}
+
+// The sRGB level at or below `value`, or the next one if `value` is more than the fraction `threshold` of the way to
+// it. The fraction is measured in linear light, so that the mean is right for an eye that sees no single pixels.
+// Measured in levels, it differs by less than 1/128.
+inline int ditherSrgb8(float value, double threshold)
+{
+    static const std::array<double, 256> light = [] {
+        std::array<double, 256> levels{};
+        for (int k = 0; k < 256; ++k)
+            levels[static_cast<std::size_t>(k)] = srgbInverse(2 * k).high;
+        return levels;
+    }();
+    if (!(value > 0.0f))
+        return 0;
+    if (value >= 1.0f)
+        return 255;
+    const auto linear = static_cast<double>(value);
+    std::size_t below = toSrgb8(linear);
+    below -= linear < light[below] ? 1 : 0;
+    const bool isAbove = linear - light[below] > threshold * (light[below + 1] - light[below]);
+    return static_cast<int>(below) + (isAbove ? 1 : 0);
 }
 
 } // namespace detail

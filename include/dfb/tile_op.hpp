@@ -49,6 +49,7 @@
 
 #include <dfb/base/detect.hpp>
 #include <dfb/blend/background_pixels.hpp>
+#include <dfb/compiled.hpp>
 #include <dfb/fragment.hpp>
 #include <dfb/image.hpp>
 
@@ -116,64 +117,14 @@ public:
     // +infinity); and those auxiliary channels that the image has. Every row must be set once. Returns what
     // convertPixels() or ditherPixels() returns.
     template <class Real>
-    double setRow(int y, const Real* rgba, const float* depth, const AuxRow& aux = {})
-    {
-        const std::size_t first = static_cast<std::size_t>(y) * stride_;
-        overwrites(0, y, width());
-        double farthest = 0;
-        if (std::byte* color = to_.at[detail::Color]; color) {
-            color += first * bytesPerPixel(format_);
-            farthest = dither_ ? ditherPixels(rgba, width(), format_, region_.x0, region_.y0 + y, color)
-                               : convert(rgba, width(), color);
-        }
-        const auto set = [&](detail::Channel channel, const auto* from, auto empty) {
-            if (!to_.at[channel])
-                return;
-            const auto words = static_cast<std::size_t>(detail::channelWords[channel]);
-            const std::size_t count = words * static_cast<std::size_t>(width());
-            auto* out = reinterpret_cast<decltype(empty)*>(to_.at[channel]) + words * first;
-            if (from)
-                std::copy(from, from + count, out);
-            else
-                std::fill(out, out + count, empty);
-        };
-        set(detail::Depth, depth, std::numeric_limits<float>::infinity());
-        set(detail::Normal, aux.normal, 0.0f);
-        set(detail::Albedo, aux.albedo, 0.0f);
-        set(detail::Position, aux.position, 0.0f);
-        set(detail::PrimitiveId, aux.primitiveId, noId);
-        set(detail::InstanceId, aux.instanceId, noId);
-        return farthest;
-    }
+    double setRow(int y, const Real* rgba, const float* depth, const AuxRow& aux = {});
 
     // Sets pixels [x, x + count) of row y, in place of setRow(), in an image without dithering and without auxiliary
     // channels. Every pixel must be set once.
-    double setPixels(int x, int y, int count, const double* rgba, const float* depth)
-    {
-        const std::size_t first = pixelAt(x, y);
-        overwrites(x, y, count);
-        if (float* out = detail::floatsOf(to_.at[detail::Depth]))
-            std::copy(depth, depth + count, out + first);
-        std::byte* color = to_.at[detail::Color];
-        return color ? convert(rgba, count, color + first * bytesPerPixel(format_)) : 0;
-    }
+    double setPixels(int x, int y, int count, const double* rgba, const float* depth);
     // Sets the colour of pixels [x, x + count) of row y from floats, which a float image gets as they are; -0 becomes
     // 0.
-    void setPixels(int x, int y, int count, const float* rgba)
-    {
-        overwrites(x, y, count);
-        std::byte* color = to_.at[detail::Color];
-        if (!color)
-            return;
-        color += pixelAt(x, y) * bytesPerPixel(format_);
-        if (format_ != OutputFormat::RGBA32F) {
-            convertPixels(rgba, count, format_, color);
-            return;
-        }
-        float* out = detail::floatsOf(color);
-        const int stored = isPastCache_ ? 4 * detail::streamPixels(rgba, count, out) : 0;
-        detail::fastest<detail::copyFloats>(rgba + stored, 4 * count - stored, out + stored);
-    }
+    void setPixels(int x, int y, int count, const float* rgba);
     // Sets pixels [x, x + count) of row y to colours that are given as they are stored, bytesPerPixel(format()) bytes
     // each, and to these depths, which may be null if the image has none.
     void setStored(int x, int y, int count, const std::byte* stored, const float* depth)
@@ -211,11 +162,7 @@ public:
 
 private:
     template <class Real>
-    double convert(const Real* rgba, int count, std::byte* color) const
-    {
-        const int stored = isPastCache_ ? detail::streamPixels(rgba, count, detail::floatsOf(color)) : 0;
-        return convertPixels(rgba + 4 * stored, count - stored, format_, color + 16 * stored);
-    }
+    double convert(const Real* rgba, int count, std::byte* color) const;
 
     std::size_t pixelAt(int x, int y) const
     {
@@ -392,4 +339,81 @@ constexpr bool checkTileOp()
 
 } // namespace detail
 
+DFB_NAMESPACE_END
+
+#if DFB_HAS_BODIES
+#include <dfb/levels.hpp>
+
+DFB_NAMESPACE_BEGIN
+
+template <class Real>
+double FinishedTile::convert(const Real* rgba, int count, std::byte* color) const
+{
+    const int stored = isPastCache_ ? detail::streamPixels(rgba, count, detail::floatsOf(color)) : 0;
+    return convertPixels(rgba + 4 * stored, count - stored, format_, color + 16 * stored);
+}
+
+template <class Real>
+double FinishedTile::setRow(int y, const Real* rgba, const float* depth, const AuxRow& aux)
+{
+    const std::size_t first = static_cast<std::size_t>(y) * stride_;
+    overwrites(0, y, width());
+    double farthest = 0;
+    if (std::byte* color = to_.at[detail::Color]; color) {
+        color += first * bytesPerPixel(format_);
+        farthest = dither_ ? ditherPixels(rgba, width(), format_, region_.x0, region_.y0 + y, color)
+                           : convert(rgba, width(), color);
+    }
+    const auto set = [&](detail::Channel channel, const auto* from, auto empty) {
+        if (!to_.at[channel])
+            return;
+        const auto words = static_cast<std::size_t>(detail::channelWords[channel]);
+        const std::size_t count = words * static_cast<std::size_t>(width());
+        auto* out = reinterpret_cast<decltype(empty)*>(to_.at[channel]) + words * first;
+        if (from)
+            std::copy(from, from + count, out);
+        else
+            std::fill(out, out + count, empty);
+    };
+    set(detail::Depth, depth, std::numeric_limits<float>::infinity());
+    set(detail::Normal, aux.normal, 0.0f);
+    set(detail::Albedo, aux.albedo, 0.0f);
+    set(detail::Position, aux.position, 0.0f);
+    set(detail::PrimitiveId, aux.primitiveId, noId);
+    set(detail::InstanceId, aux.instanceId, noId);
+    return farthest;
+}
+
+DFB_COMPILED_ONCE double FinishedTile::setPixels(int x, int y, int count, const double* rgba, const float* depth)
+{
+    const std::size_t first = pixelAt(x, y);
+    overwrites(x, y, count);
+    if (float* out = detail::floatsOf(to_.at[detail::Depth]))
+        std::copy(depth, depth + count, out + first);
+    std::byte* color = to_.at[detail::Color];
+    return color ? convert(rgba, count, color + first * bytesPerPixel(format_)) : 0;
+}
+
+DFB_COMPILED_ONCE void FinishedTile::setPixels(int x, int y, int count, const float* rgba)
+{
+    overwrites(x, y, count);
+    std::byte* color = to_.at[detail::Color];
+    if (!color)
+        return;
+    color += pixelAt(x, y) * bytesPerPixel(format_);
+    if (format_ != OutputFormat::RGBA32F) {
+        convertPixels(rgba, count, format_, color);
+        return;
+    }
+    float* out = detail::floatsOf(color);
+    const int stored = isPastCache_ ? 4 * detail::streamPixels(rgba, count, out) : 0;
+    detail::fastest<detail::copyFloats>(rgba + stored, 4 * count - stored, out + stored);
+}
+
+DFB_NAMESPACE_END
+#endif
+
+DFB_NAMESPACE_BEGIN
+DFB_COMPILED_TEMPLATE(double FinishedTile::setRow(int, const float*, const float*, const AuxRow&));
+DFB_COMPILED_TEMPLATE(double FinishedTile::setRow(int, const double*, const float*, const AuxRow&));
 DFB_NAMESPACE_END

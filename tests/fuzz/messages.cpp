@@ -419,13 +419,13 @@ private:
         peer_->whenDone = [this, number, done = false]() mutable {
             if (std::exchange(done, true))
                 return false;
-            d::ByteWriter reason;
+            d::SmallBytes reason;
             dfb::ErrorInfo info;
             info.kind = dfb::ErrorKind::Cancelled;
             info.rank = 1;
             put(reason, info);
             const std::uint32_t address = way_.addressOf(number);
-            peer_->send(messageOf(MessageKind::Abort, address, number, fuzz::textOf(reason.bytes())));
+            peer_->send(messageOf(MessageKind::Abort, address, number, fuzz::textOf(reason)));
             peer_->send(messageOf(MessageKind::ReduceUp, address, number, vote(way_)));
             return true;
         };
@@ -629,10 +629,10 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     dfb::ErrorInfo info;
     info.kind = dfb::ErrorKind::UserCode;
     info.message = "the renderer broke";
-    d::ByteWriter reason;
+    d::SmallBytes reason;
     put(reason, info);
-    add("abort", {}, of(MessageKind::Abort, textOf(reason.bytes())) + end + inputs({}));
-    add("failure", {}, of(MessageKind::Failure, textOf(reason.bytes())));
+    add("abort", {}, of(MessageKind::Abort, textOf(reason)) + end + inputs({}));
+    add("failure", {}, of(MessageKind::Failure, textOf(reason)));
     add("vote_that_is_none", {}, of(MessageKind::ReduceUp, Output().put(+FrameVerdict).text("no vote").bytes()));
     add("reduction_that_is_none", {}, of(MessageKind::ReduceUp, Output().put(9u).bytes()));
     add("result_from_below", {}, of(MessageKind::ReduceDown, vote({})));

@@ -4,10 +4,10 @@ cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
 set(level_0 version.hpp)
-set(level_1 base/detect.hpp base/fifo.hpp base/function_ref.hpp channels.hpp comm/quiescence.hpp compiled.hpp
-            frame/hidden_tiles.hpp fwd.hpp testing/reference.hpp trace.hpp)
-set(level_2 base/cpu.hpp base/double_double.hpp buffer.hpp comm/compression.hpp comm/heartbeat.hpp error.hpp
-            testing/error_report.hpp)
+set(level_1 base/cpu.hpp base/detect.hpp base/fifo.hpp base/function_ref.hpp base/processors.hpp channels.hpp
+            comm/quiescence.hpp compiled.hpp frame/hidden_tiles.hpp fwd.hpp testing/reference.hpp trace.hpp)
+set(level_2 base/double_double.hpp blend/composite_row.hpp buffer.hpp comm/compression.hpp comm/heartbeat.hpp error.hpp
+            testing/error_report.hpp wire/wire_kernels.hpp)
 set(level_3 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/message.hpp
             comm/mpi_calls.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp comm/transport.hpp exec.hpp
             gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)

@@ -52,9 +52,9 @@ TEST_CASE("All of an error travels", "[error]")
 {
     dfb::ErrorInfo info = infoOf(dfb::ErrorKind::DuplicateInput, 3, 1, 2);
     info.frame = 4, info.tile = 5, info.pass = 6, info.source = 7, info.expected = 8, info.got = 9;
-    dfb::detail::ByteWriter out;
+    dfb::detail::SmallBytes out;
     put(out, info);
-    dfb::detail::ByteReader in(out.bytes());
+    dfb::detail::ByteReader in(out);
     const dfb::ErrorInfo back = dfb::detail::getErrorInfo(in);
     in.end();
     CHECK(back.describe() == info.describe());

@@ -2,6 +2,7 @@
 #include "catch.hpp"
 
 #include <dfb/image.hpp>
+#include <dfb/levels.hpp>
 #include <dfb/testing/reference.hpp>
 
 #include <algorithm>

@@ -3,6 +3,7 @@
 #include "catch.hpp"
 
 #include <dfb/image.hpp>
+#include <dfb/levels.hpp>
 #include <dfb/testing/adversarial.hpp>
 
 #include <algorithm>
@@ -31,8 +32,7 @@ std::uint8_t searchedSrgb8(double value, bool& isNear)
         std::array<double, 255> all{}; // the least value of each level from 1 on
         for (int k = 0; k < 255; ++k) {
             const auto boundary = dfb::detail::srgbBoundary(k);
-            all[static_cast<std::size_t>(k)] =
-                boundary.low > 0 ? std::nextafter(boundary.high, 2.0) : boundary.high;
+            all[static_cast<std::size_t>(k)] = boundary.low > 0 ? std::nextafter(boundary.high, 2.0) : boundary.high;
         }
         return all;
     }();

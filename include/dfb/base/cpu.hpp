@@ -11,15 +11,10 @@
 
 #include <dfb/version.hpp>
 
-#include <algorithm>
-#include <bitset>
 #include <cstddef>
 #include <cstdint>
-#include <thread>
-#include <type_traits>
 
 #if (defined(__GNUC__) || defined(__clang__)) && defined(__x86_64__)
-#include <immintrin.h>
 #define DFB_HAS_AVX2_CLONES 1
 #if defined(__clang__)
 #define DFB_AVX2 __attribute__((target("avx2,f16c")))
@@ -39,10 +34,6 @@
 
 #if defined(__SSE2__) || defined(_M_X64)
 #include <xmmintrin.h>
-#endif
-
-#if defined(__linux__)
-#include <sched.h>
 #endif
 
 DFB_NAMESPACE_BEGIN
@@ -73,6 +64,19 @@ template <auto Body, class... Arguments>
 inline auto fastest(Arguments... arguments) noexcept
 {
     return DFB_FASTEST(Body, withAvx2<Body>, arguments...);
+}
+
+// Prefetches a piece of a row into the second-level cache, as no processor predicts where the next row begins. The
+// first-level cache is too small: rows of an image are often a multiple of 4 KiB apart, so that rows of several inputs
+// evict each other. Always inlined, as GCC removes calls of functions that do nothing else.
+DFB_INLINE void prefetch(const std::byte* from, std::size_t bytes)
+{
+#if defined(__GNUC__)
+    for (std::size_t i = 0; i < bytes; i += 64)
+        __builtin_prefetch(from + i, 0, 2);
+#else
+    (void)from, (void)bytes;
+#endif
 }
 
 // How many zeros are below the lowest bit that is set. At least one bit must be set.
@@ -137,45 +141,5 @@ private:
 };
 
 } // namespace detail
-
-// Processors: the set of processors that a thread may run on, as plain bytes that can be sent. Processors numbered
-// `limit` and above are left out.
-class Processors {
-public:
-    static constexpr int limit = 1024;
-
-    // The CPU mask of the calling thread, which the threads that it starts inherit. If the mask cannot be queried, this
-    // is the set of all processors of the machine. Never empty.
-    static Processors ofThisThread() noexcept
-    {
-        Processors found;
-#if defined(__linux__)
-        cpu_set_t mask;
-        if (sched_getaffinity(0, sizeof mask, &mask) == 0)
-            for (int i = 0; i < std::min<int>(limit, CPU_SETSIZE); ++i)
-                if (CPU_ISSET(static_cast<unsigned>(i), &mask))
-                    found.add(i);
-#endif
-        if (found.count() == 0)
-            for (int i = 0; i < std::clamp(static_cast<int>(std::thread::hardware_concurrency()), 1, limit); ++i)
-                found.add(i);
-        return found;
-    }
-
-    // `processor`: 0 to limit - 1.
-    void add(int processor) noexcept { set_[static_cast<std::size_t>(processor)] = true; }
-
-    int count() const noexcept { return static_cast<int>(set_.count()); }
-
-    // Whether any processor is in both sets.
-    bool meets(const Processors& other) const noexcept { return (set_ & other.set_).any(); }
-
-private:
-    std::bitset<limit> set_;
-};
-static_assert(std::is_trivially_copyable_v<Processors> && sizeof(Processors) == Processors::limit / 8);
-
-// How many threads each of `ranks` ranks should have if they share `processors` processors: an equal part, at least 1.
-inline int threadShare(int processors, int ranks) noexcept { return std::max(1, processors / std::max(1, ranks)); }
 
 DFB_NAMESPACE_END

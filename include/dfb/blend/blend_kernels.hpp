@@ -13,6 +13,10 @@
 #include <cstddef>
 #include <cstdint>
 
+#if defined(DFB_HAS_AVX2_CLONES)
+#include <immintrin.h>
+#endif
+
 DFB_NAMESPACE_BEGIN
 namespace detail {
 

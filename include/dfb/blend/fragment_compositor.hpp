@@ -6,6 +6,7 @@
 #include <dfb/blend/compositing.hpp>
 #include <dfb/blend/in_place_kernels.hpp>
 #include <dfb/fragment.hpp>
+#include <dfb/wire/wire_kernels.hpp>
 
 #include <algorithm>
 #include <array>
@@ -15,13 +16,6 @@
 #include <vector>
 
 DFB_NAMESPACE_BEGIN
-
-// How the inputs of a pixel become one.
-enum class BlendRule {
-    SortByDepth, // sortAndBlend
-    InOrder,     // over, in the order of the fragments
-    Nearest      // keepNearest
-};
 
 // Composites the fragments of one tile and pass, row by row. Where depths are equal, the fragments' order decides: sort
 // them by (source, part) first.

@@ -7,6 +7,7 @@
 #include <dfb/blend/blend_kernels.hpp>
 #include <dfb/blend/sort_kernels.hpp>
 #include <dfb/wire/active_pixels.hpp>
+#include <dfb/wire/wire_kernels.hpp>
 
 #include <algorithm>
 #include <cstddef>

@@ -2,7 +2,7 @@
 // message is for, checks that each message comes once and whole, and moves messages (section 3.2 of the paper).
 #pragma once
 
-#include <dfb/base/cpu.hpp>
+#include <dfb/base/processors.hpp>
 #include <dfb/comm/heartbeat.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
@@ -328,12 +328,12 @@ public:
     {
         if (!setFailure(error))
             return false;
-        detail::ByteWriter body;
+        detail::SmallBytes body;
         put(body, error);
         const auto header = detail::MessageHeader::of(detail::MessageKind::Failure);
         for (int other = 0; other < size(); ++other)
             if (other != rank())
-                send(other, detail::makeMessage(*pool_, header, body.bytes()));
+                send(other, detail::makeMessage(*pool_, header, body));
         tellReceivers();
         return true;
     }

@@ -149,9 +149,9 @@ public:
     template <class Body>
     void sendBody(int destination, MessageKind kind, std::int64_t number, const Body& body)
     {
-        ByteWriter bytes;
+        SmallBytes bytes;
         bytes.put(body);
-        send(destination, kind, number, bytes.bytes());
+        send(destination, kind, number, bytes);
     }
 
     static bool needsCredit(MessageKind kind)
@@ -392,10 +392,10 @@ public:
     template <class Operation>
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, const char* how, Operation operation)
     {
-        ByteWriter mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
+        SmallBytes mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
         for (const std::int64_t value : values)
             mine.put(value);
-        const Bytes result = reduceParts(std::move(mine), [operation](ByteReader& a, ByteReader& b, ByteWriter& out) {
+        const Bytes result = reduceParts(std::move(mine), [operation](ByteReader& a, ByteReader& b, SmallBytes& out) {
             while (a.left() > 0) {
                 const auto x = a.get<std::int64_t>(), y = b.get<std::int64_t>();
                 out.put(operation(x, y));
@@ -413,11 +413,11 @@ public:
     // allReduce().
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call)
     {
-        ByteWriter mine = partOf(call); // then, for each rank: its number, the size, the bytes
+        SmallBytes mine = partOf(call); // then, for each rank: its number, the size, the bytes
         mine.put(static_cast<std::int32_t>(rank()));
         mine.put(static_cast<std::uint64_t>(own.size()));
-        mine.putBytes(own.data(), own.data() + own.size());
-        const Bytes all = reduceParts(std::move(mine), [](ByteReader& a, ByteReader& b, ByteWriter& out) {
+        mine.append(own.data(), own.data() + own.size());
+        const Bytes all = reduceParts(std::move(mine), [](ByteReader& a, ByteReader& b, SmallBytes& out) {
             a.copyTo(out);
             b.copyTo(out);
         });
@@ -437,9 +437,9 @@ public:
 private:
     // Begins the part that this rank brings to a call, with its rank and the call's name. In a combined part the lowest
     // of the ranks stands there; or -1 and a text, if the ranks have made different calls.
-    ByteWriter partOf(const std::string& call) const
+    SmallBytes partOf(const std::string& call) const
     {
-        ByteWriter out;
+        SmallBytes out;
         out.put(static_cast<std::int32_t>(rank()));
         out.putText(call);
         return out;
@@ -447,15 +447,15 @@ private:
 
     // Reduces the parts that ranks bring to a call. `combine(a, b, out)` combines what follows the call's name in two
     // parts.
-    Bytes reduceParts(ByteWriter&& mine, std::function<void(ByteReader&, ByteReader&, ByteWriter&)> combine)
+    Bytes reduceParts(SmallBytes&& mine, std::function<void(ByteReader&, ByteReader&, SmallBytes&)> combine)
     {
-        return reduce(std::move(mine).bytes(), [combine = std::move(combine)](const Bytes& a, const Bytes& b) {
+        return reduce(std::move(mine), [combine = std::move(combine)](const Bytes& a, const Bytes& b) {
             ByteReader as(a), bs(b);
             const auto rankA = as.get<std::int32_t>(), rankB = bs.get<std::int32_t>();
             if (rankA < 0 || rankB < 0)
                 return rankA < 0 ? a : b;
             const std::string callA = as.getText(), callB = bs.getText();
-            ByteWriter out;
+            SmallBytes out;
             if (callA == callB) {
                 out.put(rankA);
                 out.putText(callA);
@@ -465,7 +465,7 @@ private:
                 out.putText(printed("rank %d calls %s, rank %d %s: all ranks must make the same calls", rankA,
                                     callA.c_str(), rankB, callB.c_str()));
             }
-            return std::move(out).bytes();
+            return out;
         });
     }
 
@@ -668,10 +668,10 @@ private:
 
     void sendReduction(int destination, const ReductionKey& key, bool up, const Bytes& bytes)
     {
-        ByteWriter body;
+        SmallBytes body;
         body.put(key.scope);
-        body.putBytes(bytes.begin(), bytes.end());
-        send(destination, up ? MessageKind::ReduceUp : MessageKind::ReduceDown, key.number, body.bytes());
+        body.append(bytes.begin(), bytes.end());
+        send(destination, up ? MessageKind::ReduceUp : MessageKind::ReduceDown, key.number, body);
     }
 
     void receive(int source, const MessageHeader& header, Buffer&& message) override

@@ -1,6 +1,6 @@
 // Messages as bytes. Every message starts with a MessageHeader, by which it is recognised before it is used, and which
-// holds its checksum. The bodies of small control messages (manifests, verdicts): SmallBytes holds one, ByteWriter and
-// ByteReader write and read one field by field. A reader never reads beyond the end of its bytes.
+// holds its checksum. The bodies of small control messages (manifests, verdicts): SmallBytes holds one, which is
+// written field by field, and ByteReader reads it. A reader never reads beyond the end of its bytes.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -16,9 +16,7 @@
 #include <utility>
 #include <vector>
 
-#if defined(__x86_64__) && defined(__GNUC__) // Clang's, too
-#include <nmmintrin.h>
-#elif defined(__ARM_FEATURE_CRC32) && !defined(__ARM_BIG_ENDIAN)
+#if defined(__ARM_FEATURE_CRC32) && !defined(__ARM_BIG_ENDIAN)
 #include <arm_acle.h>
 #endif
 
@@ -65,14 +63,14 @@ inline std::uint32_t crc32cByTable(const std::byte* data, std::size_t byteCount,
 using Crc32cFunction = std::uint32_t (*)(const std::byte*, std::size_t, std::uint32_t);
 
 // Uses the processor's instruction, where there is one.
-#if defined(__x86_64__) && defined(__GNUC__)
+#if defined(__x86_64__) && defined(__GNUC__) // Clang's, too
 __attribute__((target("sse4.2"))) inline std::uint32_t crc32cByInstruction(const std::byte* data, std::size_t byteCount,
                                                                            std::uint32_t before)
 {
     std::uint64_t sum = ~before, word = 0;
     for (; byteCount >= 8; byteCount -= 8, data += 8) {
         std::memcpy(&word, data, 8);
-        sum = _mm_crc32_u64(sum, word);
+        sum = __builtin_ia32_crc32di(sum, word); // <nmmintrin.h> would take long to compile
     }
     return crc32cByTable(data, byteCount, ~static_cast<std::uint32_t>(sum));
 }
@@ -204,7 +202,8 @@ struct Arrival {
     Buffer message;
 };
 
-// The bytes of a control message. A message of usual size needs no memory from the heap.
+// The bytes of a control message, written one field after the other. A message of usual size needs no memory from the
+// heap.
 class SmallBytes {
 public:
     SmallBytes() = default;
@@ -214,6 +213,20 @@ public:
     [[gnu::noinline]] SmallBytes& operator=(SmallBytes&&) = default;
     [[gnu::noinline]] ~SmallBytes() = default;
     SmallBytes(const std::byte* first, const std::byte* last) { append(first, last); }
+
+    template <class T>
+    void put(const T& value)
+    {
+        static_assert(std::is_trivially_copyable_v<T>);
+        const auto* first = reinterpret_cast<const std::byte*>(&value);
+        append(first, first + sizeof value);
+    }
+    void putText(const std::string& text)
+    {
+        put(static_cast<std::uint32_t>(text.size()));
+        const auto* first = reinterpret_cast<const std::byte*>(text.data());
+        append(first, first + text.size());
+    }
 
     std::size_t size() const noexcept { return many_.empty() ? fewCount_ : many_.size(); }
     bool empty() const noexcept { return size() == 0; }
@@ -256,30 +269,6 @@ inline Buffer makeMessage(MemoryPool& pool, const MessageHeader& header, const S
     return message;
 }
 
-class ByteWriter {
-public:
-    template <class T>
-    void put(const T& value)
-    {
-        static_assert(std::is_trivially_copyable_v<T>);
-        const auto* first = reinterpret_cast<const std::byte*>(&value);
-        bytes_.append(first, first + sizeof value);
-    }
-    void putText(const std::string& text)
-    {
-        put(static_cast<std::uint32_t>(text.size()));
-        const auto* first = reinterpret_cast<const std::byte*>(text.data());
-        bytes_.append(first, first + text.size());
-    }
-    void putBytes(const std::byte* first, const std::byte* last) { bytes_.append(first, last); }
-    void clear() noexcept { bytes_.clear(); }
-    const SmallBytes& bytes() const& noexcept { return bytes_; }
-    SmallBytes bytes() && noexcept { return std::move(bytes_); }
-
-private:
-    SmallBytes bytes_;
-};
-
 class ByteReader {
 public:
     ByteReader(const std::byte* data, std::size_t size) : next_(data), left_(size) {}
@@ -306,7 +295,7 @@ public:
         std::copy(from, from + count, to);
     }
     // Appends all bytes that are left to `out`.
-    void copyTo(ByteWriter& out) const { out.putBytes(next_, next_ + left_); }
+    void copyTo(SmallBytes& out) const { out.append(next_, next_ + left_); }
     // Throws Error (MalformedMessage) when bytes are left.
     void end() const
     {
@@ -337,7 +326,7 @@ private:
     std::size_t left_;
 };
 
-inline void put(ByteWriter& out, const ErrorInfo& e)
+inline void put(SmallBytes& out, const ErrorInfo& e)
 {
     out.put(e.kind);
     out.put(static_cast<std::int32_t>(e.rank));

@@ -5,8 +5,8 @@
 // it. No version may change that.
 #pragma once
 
-#include <dfb/base/cpu.hpp>
 #include <dfb/base/function_ref.hpp>
+#include <dfb/base/processors.hpp>
 #include <dfb/buffer.hpp>
 #include <dfb/comm/mpi_calls.hpp>
 #include <dfb/comm/node_memory.hpp>

@@ -11,9 +11,9 @@
 // Receives of packets are posted beforehand: nothing is ever probed for. They take 64 KiB per transport.
 #pragma once
 
-#include <dfb/base/cpu.hpp>
 #include <dfb/base/fifo.hpp>
 #include <dfb/base/function_ref.hpp>
+#include <dfb/base/processors.hpp>
 #include <dfb/comm/connection.hpp>
 #include <dfb/comm/mpi_calls.hpp>
 #include <dfb/comm/mpi_ranks.hpp>

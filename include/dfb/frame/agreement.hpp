@@ -103,13 +103,13 @@ struct Agreement {
 
     SmallBytes bytes() const
     {
-        ByteWriter out;
+        SmallBytes out;
         out.put(static_cast<std::uint8_t>(fine));
         out.put(static_cast<std::int32_t>(rank));
         out.putText(text);
         for (const OnNode& its : nodes)
             out.put(its);
-        return out.bytes();
+        return out;
     }
 
     static Agreement from(const SmallBytes& bytes)

@@ -135,7 +135,7 @@ public:
                 manifest_.put(input.source);
                 manifest_.put(input.part);
             });
-            send(its.owner, manifest_.bytes());
+            send(its.owner, manifest_);
         }
         told_.swap(toTell_);
         return isWaiting;
@@ -228,7 +228,7 @@ private:
     bool haveMoved_ = false;               // tiles have other owners since then
     std::vector<Addressed> told_, toTell_; // by owner: what was told last; what is to be told now
     std::vector<Addressed> news_;          // what only one of them has; then one for each owner
-    ByteWriter manifest_;                  // for one owner
+    SmallBytes manifest_;                  // for one owner
 };
 
 } // namespace detail

@@ -252,11 +252,11 @@ private:
 
     void tellOthers(const ErrorInfo& info)
     {
-        ByteWriter body;
+        SmallBytes body;
         put(body, info);
         for (int other = 0; other < mailbox_.size(); ++other)
             if (other != mailbox_.rank())
-                mailbox_.send(other, MessageKind::Abort, frame_.number(), body.bytes());
+                mailbox_.send(other, MessageKind::Abort, frame_.number(), body);
     }
 
     void receiveAbort(const MessageHeader& header, const Buffer& message)
@@ -364,9 +364,9 @@ private:
 
         Bytes bytes() const
         {
-            ByteWriter out;
+            SmallBytes out;
             out.put(*this);
-            return out.bytes();
+            return out;
         }
         static Round from(const Bytes& bytes)
         {

@@ -8,6 +8,7 @@
 #include <dfb/frame/operations.hpp>
 #include <dfb/frame/tile_table.hpp>
 #include <dfb/gather/final_gather.hpp>
+#include <dfb/levels.hpp>
 #include <dfb/wire/fragment_message.hpp>
 #include <dfb/wire/wire_losses.hpp>
 

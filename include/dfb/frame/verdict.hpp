@@ -169,7 +169,7 @@ struct Verdict {
 
     SmallBytes bytes() const
     {
-        ByteWriter out;
+        SmallBytes out;
         out.put(static_cast<std::uint8_t>(error.has_value()));
         if (error)
             put(out, *error);
@@ -186,7 +186,7 @@ struct Verdict {
         out.put(static_cast<std::uint32_t>(incomplete.size()));
         for (const std::int32_t tile : incomplete)
             out.put(tile);
-        return out.bytes();
+        return out;
     }
 
     static Verdict from(const SmallBytes& bytes)

@@ -67,11 +67,11 @@ public:
         tellSent(frame);
         mailbox_->wait([&] { return isOver(frame); }, deadline);
         const std::optional<ErrorInfo> mine = whatIsMissing(frame);
-        ByteWriter missing; // empty if nothing is missing
+        SmallBytes missing; // empty if nothing is missing
         if (mine)
             detail::put(missing, *mine);
         const Bytes all =
-            mailbox_->reduce(missing.bytes(), [](const Bytes& a, const Bytes& b) { return a.empty() ? b : a; });
+            mailbox_->reduce(missing, [](const Bytes& a, const Bytes& b) { return a.empty() ? b : a; });
         const std::lock_guard<std::mutex> lock(mutex_);
         if (const auto done = coming_.find(frame); done != coming_.end() && all.empty())
             for (auto& [display, picture] : *done->second)
@@ -359,10 +359,10 @@ private:
             {SentPixels, frame}, Bytes(first, first + mine.size() * sizeof mine[0]),
             [](const Bytes& a, const Bytes& b) { // of equal length, see receiveSent()
                 ByteReader x(a), y(b);
-                ByteWriter sums;
+                SmallBytes sums;
                 while (x.left() > 0)
                     sums.put(x.get<std::uint64_t>() + y.get<std::uint64_t>());
-                return sums.bytes();
+                return sums;
             },
             [this, frame](const Bytes& all) {
                 {

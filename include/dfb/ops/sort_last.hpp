@@ -2,8 +2,9 @@
 // the paper), OrderedBlend is told their order, DepthComposite keeps the nearest.
 #pragma once
 
+#include <dfb/base/double_double.hpp>
 #include <dfb/base/function_ref.hpp>
-#include <dfb/blend/fragment_compositor.hpp>
+#include <dfb/blend/composite_row.hpp>
 #include <dfb/compiled.hpp>
 #include <dfb/tile_op.hpp>
 
@@ -153,26 +154,9 @@ public:
     std::int64_t undefinedPixels() const noexcept { return undefinedPixels_; }
 
 private:
-    struct Scratch {
-        std::vector<const Fragment*> pointers; // in the order of blending, pass by pass
-        std::vector<FragmentCompositor> compositors;
-        CompositeRow row;
-        std::vector<std::uint8_t> isUndefined;
-        NearestBytes nearest;
-        std::vector<std::uint8_t> levels; // of a row
-        // For exactRow().
-        std::vector<DoubleDouble> exactMean;
-        CompositeRow exactRow;
-        FragmentCompositor exactCompositor;
-    };
+    struct Scratch;
 
-    // One object per thread, so that a frame after the first allocates nothing.
-    static Scratch& scratch()
-    {
-        static thread_local Scratch ofThread;
-        return ofThread;
-    }
-
+    static Scratch& scratch();
     Scratch& start();
     void finishRuns(FinishedTile& out);
     void finishBytes(FinishedTile& out);
@@ -329,8 +313,30 @@ static_assert(is_tile_op_v<AlphaBlend> && is_tile_op_v<OrderedBlend> && is_tile_
 DFB_NAMESPACE_END
 
 #if DFB_HAS_BODIES
+#include <dfb/blend/fragment_compositor.hpp>
+
 DFB_NAMESPACE_BEGIN
 namespace detail {
+
+struct FragmentStore::Scratch {
+    std::vector<const Fragment*> pointers; // in the order of blending, pass by pass
+    std::vector<FragmentCompositor> compositors;
+    CompositeRow row;
+    std::vector<std::uint8_t> isUndefined;
+    NearestBytes nearest;
+    std::vector<std::uint8_t> levels; // of a row
+    // For exactRow().
+    std::vector<DoubleDouble> exactMean;
+    CompositeRow exactRow;
+    FragmentCompositor exactCompositor;
+};
+
+// One object per thread, so that a frame after the first allocates nothing.
+DFB_COMPILED_ONCE FragmentStore::Scratch& FragmentStore::scratch()
+{
+    static thread_local Scratch ofThread;
+    return ofThread;
+}
 
 DFB_COMPILED_ONCE void FragmentStore::removeBehind(int generation)
 {

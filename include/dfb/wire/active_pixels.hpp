@@ -4,6 +4,7 @@
 
 #include <dfb/base/cpu.hpp>
 #include <dfb/channels.hpp>
+#include <dfb/compiled.hpp>
 #include <dfb/image.hpp>
 #include <dfb/wire/wire_format.hpp>
 
@@ -12,7 +13,6 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <cstring>
 #include <limits>
 #include <vector>
 
@@ -26,18 +26,6 @@ struct Span {
 
 namespace detail {
 
-// Prefetches a piece of a row into the second-level cache, as no processor predicts where the next row begins. The
-// first-level cache is too small: rows of an image are often a multiple of 4 KiB apart, so that rows of several inputs
-// evict each other. Always inlined, as GCC removes calls of functions that do nothing else.
-DFB_INLINE void prefetch(const std::byte* from, std::size_t bytes)
-{
-#if defined(__GNUC__)
-    for (std::size_t i = 0; i < bytes; i += 64)
-        __builtin_prefetch(from + i, 0, 2);
-#else
-    (void)from, (void)bytes;
-#endif
-}
 // The row to prefetch while row y is read. For the last rows before `yEnd` it is y itself. Prefetching 4 KiB of colours
 // ahead was fastest where it was measured. Prefetch the row in pieces, between the work on row y: all at once takes up
 // to a quarter longer.
@@ -45,190 +33,6 @@ inline int rowAhead(int y, int yEnd, int width)
 {
     const int ahead = y + (width < 64 ? 1 : std::max(1, 256 / width));
     return ahead < yEnd ? ahead : y;
-}
-
-// Returns a bit for each of up to 64 pixels, set if any of its colour channels is not 0.
-DFB_INLINE std::uint64_t findActivePixels(const float* rgba, int count)
-{
-    std::uint64_t bits = 0;
-    for (int i = 0; i < count; ++i) { // all bits but the signs
-        std::uint64_t halves[2];
-        std::memcpy(halves, rgba + 4 * i, sizeof halves);
-        bits |= std::uint64_t{((halves[0] | halves[1]) & 0x7fffffff7fffffffu) != 0} << i;
-    }
-    return bits;
-}
-
-// Copies colours. Returns false if one is not finite, or an alpha is not within [0, 1]. There are no branches, so that
-// it can be vectorized.
-inline bool copyAndCheckColors(const float* rgba, int count, float* out)
-{
-    constexpr float most = std::numeric_limits<float>::max();
-    constexpr float low[4] = {-most, -most, -most, 0}, high[4] = {most, most, most, 1};
-    int bad[4] = {};
-    for (int i = 0; i < 4 * count; i += 4)
-        for (int c = 0; c < 4; ++c) {
-            const float value = rgba[i + c];
-            out[i + c] = value;
-            bad[c] |= static_cast<int>(!(value >= low[c])) | static_cast<int>(!(value <= high[c]));
-        }
-    return (bad[0] | bad[1] | bad[2] | bad[3]) == 0;
-}
-
-#if defined(DFB_HAS_AVX2_CLONES)
-// Checks colours as copyAndCheckColors() does.
-struct Avx2ColorCheck {
-    __m256 areInside;
-
-    DFB_AVX2 DFB_INLINE void clear() { areInside = _mm256_castsi256_ps(_mm256_set1_epi32(-1)); }
-    DFB_AVX2 DFB_INLINE void add(__m256 two)
-    {
-        constexpr float most = std::numeric_limits<float>::max();
-        const __m256 low = _mm256_setr_ps(-most, -most, -most, 0, -most, -most, -most, 0);
-        const __m256 high = _mm256_setr_ps(most, most, most, 1, most, most, most, 1);
-        areInside = _mm256_and_ps(
-            areInside, _mm256_and_ps(_mm256_cmp_ps(two, low, _CMP_GE_OQ), _mm256_cmp_ps(two, high, _CMP_LE_OQ)));
-    }
-    DFB_AVX2 DFB_INLINE bool isGood() const { return _mm256_movemask_ps(areInside) == 255; }
-};
-
-// With `Copies`, also does what copyAndCheckColors() does, and sets `isGood` to false where that would return false.
-template <bool Copies>
-DFB_AVX2 std::uint64_t findActivePixelsAvx2(const float* rgba, const float* ahead, int count, float* out, bool& isGood)
-{
-    const __m256i zero = _mm256_setzero_si256(), allButSign = _mm256_set1_epi32(0x7fffffff);
-    Avx2ColorCheck check;
-    check.clear();
-    std::uint64_t bits = 0;
-    int i = 0;
-    for (; i + 8 <= count; i += 8) {
-        prefetch(reinterpret_cast<const std::byte*>(ahead + 4 * i), 128);
-        __m256i isZero[4]; // of 2 pixels each
-        for (int k = 0; k < 4; ++k) {
-            const __m256 two = _mm256_loadu_ps(rgba + 4 * i + 8 * k);
-            if constexpr (Copies) {
-                _mm256_storeu_ps(out + 4 * i + 8 * k, two);
-                check.add(two);
-            }
-            isZero[k] = _mm256_cmpeq_epi32(_mm256_and_si256(_mm256_castps_si256(two), allButSign), zero);
-        }
-        // A byte for each value, 4 for each pixel. The pixels are in the order 0 2 4 6 1 3 5 7.
-        __m256i bytes =
-            _mm256_packs_epi16(_mm256_packs_epi32(isZero[0], isZero[1]), _mm256_packs_epi32(isZero[2], isZero[3]));
-        bytes = _mm256_permutevar8x32_epi32(bytes, _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7));
-        const int none = _mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpeq_epi32(bytes, _mm256_set1_epi32(-1))));
-        bits |= static_cast<std::uint64_t>(~none & 255) << i;
-    }
-    if (Copies && !check.isGood())
-        isGood = false;
-    if (i == count)
-        return bits;
-    if (Copies && !copyAndCheckColors(rgba + 4 * i, count - i, out + 4 * i))
-        isGood = false;
-    return bits | findActivePixels(rgba + 4 * i, count - i) << i;
-}
-#endif
-
-template <bool Copies>
-std::uint64_t findActivePixelsPlain(const float* rgba, const float* ahead, int count, float* out, bool& isGood)
-{
-    prefetch(reinterpret_cast<const std::byte*>(ahead), 4 * sizeof(float) * static_cast<std::size_t>(count));
-    if (Copies && !copyAndCheckColors(rgba, count, out))
-        isGood = false;
-    return findActivePixels(Copies ? out : rgba, count);
-}
-
-// Calls findActivePixels() in its fastest version. `ahead`: as many pixels there are prefetched meanwhile.
-inline std::uint64_t activePixelBits(const float* rgba, const float* ahead, int count)
-{
-    bool isGood = true;
-    return DFB_FASTEST(findActivePixelsPlain<false>, findActivePixelsAvx2<false>, rgba, ahead, count, nullptr, isGood);
-}
-
-// Does the same and copies all pixels, in one pass. Sets `isGood` to false if copyAndCheckColors() would return false.
-inline std::uint64_t copyAndFindActivePixels(const float* rgba, const float* ahead, int count, float* out, bool& isGood)
-{
-    return DFB_FASTEST(findActivePixelsPlain<true>, findActivePixelsAvx2<true>, rgba, ahead, count, out, isGood);
-}
-
-// Like findActivePixels(), for pixels with 8 bits a channel.
-DFB_INLINE std::uint64_t findActiveBytes(const std::byte* rgba, int count)
-{
-    std::uint64_t bits = 0;
-    for (int i = 0; i < count; ++i) {
-        std::uint32_t pixel = 0;
-        std::memcpy(&pixel, rgba + 4 * i, sizeof pixel);
-        bits |= std::uint64_t{pixel != 0} << i;
-    }
-    return bits;
-}
-
-#if defined(DFB_HAS_AVX2_CLONES)
-DFB_AVX2 inline std::uint64_t findActiveBytesAvx2(const std::byte* rgba, int count)
-{
-    const __m256i zero = _mm256_setzero_si256();
-    std::uint64_t bits = 0;
-    int i = 0;
-    for (; i + 8 <= count; i += 8) {
-        const __m256i pixels = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(rgba + 4 * i));
-        const int none = _mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpeq_epi32(pixels, zero)));
-        bits |= static_cast<std::uint64_t>(~none & 255) << i;
-    }
-    return i < count ? bits | findActiveBytes(rgba + 4 * i, count - i) << i : bits;
-}
-#endif
-
-inline std::uint64_t activeByteBits(const std::byte* rgba, int count)
-{
-    return DFB_FASTEST(findActiveBytes, findActiveBytesAvx2, rgba, count);
-}
-
-// A bit for each of up to 64 pixels.
-struct DepthBits {
-    std::uint64_t active = 0; // the depth is below the limit
-    std::uint64_t nan = 0;
-};
-
-DFB_INLINE DepthBits findDepths(const float* depth, int count, float limit)
-{
-    DepthBits bits;
-    for (int i = 0; i < count; ++i) {
-        bits.active |= std::uint64_t{depth[i] < limit} << i;
-        bits.nan |= std::uint64_t{depth[i] != depth[i]} << i;
-    }
-    return bits;
-}
-
-#if defined(DFB_HAS_AVX2_CLONES)
-DFB_AVX2 inline DepthBits findDepthsAvx2(const float* depth, int count, float limit)
-{
-    const __m256 most = _mm256_set1_ps(limit);
-    const auto bitsOf8 = [](int mask) { return static_cast<std::uint64_t>(mask & 255); };
-    DepthBits bits;
-    int i = 0;
-    for (; i + 8 <= count; i += 8) {
-        const __m256 d = _mm256_loadu_ps(depth + i);
-        bits.active |= bitsOf8(_mm256_movemask_ps(_mm256_cmp_ps(d, most, _CMP_LT_OQ))) << i;
-        bits.nan |= bitsOf8(_mm256_movemask_ps(_mm256_cmp_ps(d, d, _CMP_UNORD_Q))) << i;
-    }
-    if (i == count)
-        return bits;
-    const DepthBits rest = findDepths(depth + i, count - i, limit);
-    return {bits.active | rest.active << i, bits.nan | rest.nan << i};
-}
-#endif
-
-inline DepthBits depthBits(const float* depth, int count, float limit)
-{
-    return DFB_FASTEST(findDepths, findDepthsAvx2, depth, count, limit);
-}
-
-inline bool hasNan(const float* depth, std::size_t count)
-{
-    std::uint64_t nan = 0;
-    for (std::size_t i = 0; i < count; i += 64)
-        nan |= depthBits(depth + i, static_cast<int>(std::min<std::size_t>(64, count - i)), 0).nan;
-    return nan != 0;
 }
 
 // Where pixels of a row lie. `depth` may be null.
@@ -273,83 +77,8 @@ struct Activity {
     // Returns a bit for each of up to 64 pixels, set if it is active. The depth may be null unless byDepth. Prefetches
     // as many pixels at `ahead` for a later call. Adds to `nanDepths` the pixels that are not active because their
     // depth is NaN.
-    std::uint64_t bits(const RowPlace& pixels, const RowPlace& ahead, int count, std::uint64_t& nanDepths) const
-    {
-        const bool hasLimit = pixels.depth && depthLimit < std::numeric_limits<float>::infinity();
-        if (byDepth || hasBytes)
-            ahead.prefetchAll(count, colorBytes());
-        else
-            ahead.prefetchDepth(count); // activePixelBits() loads the colours
-        const DepthBits depths = byDepth || hasLimit ? depthBits(pixels.depth, count, depthLimit) : DepthBits();
-        if (byDepth) {
-            for (std::uint64_t nan = depths.nan; nan != 0; nan &= nan - 1)
-                ++nanDepths;
-            return depths.active;
-        }
-        const std::uint64_t colors = hasBytes ? activeByteBits(pixels.color, count)
-                                              : activePixelBits(floatsOf(pixels.color), floatsOf(ahead.color), count);
-        return hasLimit ? colors & (depths.active | depths.nan) : colors;
-    }
+    std::uint64_t bits(const RowPlace& pixels, const RowPlace& ahead, int count, std::uint64_t& nanDepths) const;
 };
-
-DFB_AVX2 inline bool copyAndCheckColorsAvx2(const float* rgba, int count, float* out)
-{
-    int i = 0;
-    bool areGood = true;
-#if defined(DFB_HAS_AVX2_CLONES)
-    Avx2ColorCheck check;
-    check.clear();
-    for (; i + 2 <= count; i += 2) {
-        const __m256 two = _mm256_loadu_ps(rgba + 4 * i);
-        _mm256_storeu_ps(out + 4 * i, two);
-        check.add(two);
-    }
-    areGood = check.isGood();
-#endif
-    const bool isRestGood = i == count || copyAndCheckColors(rgba + 4 * i, count - i, out + 4 * i);
-    return isRestGood && areGood;
-}
-
-// A depth as it travels: NaN becomes +infinity, and -0 becomes 0, so that plain comparisons order depths.
-inline float canonicalDepth(float depth)
-{
-    const std::uint32_t bits = bitsOf(depth), some = bits == 0x80000000u ? 0u : bits;
-    return floatOf((bits & 0x7fffffffu) > 0x7f800000u ? 0x7f800000u : some); // integers, so that it can be vectorized
-}
-
-// Copies depths in the form in which they travel. Returns false if any is NaN.
-DFB_INLINE bool copyAndCheckDepths(const float* depth, int count, float* out)
-{
-    int isNan = 0;
-    for (int i = 0; i < count; ++i) {
-        isNan |= static_cast<int>((bitsOf(depth[i]) & 0x7fffffffu) > 0x7f800000u);
-        out[i] = canonicalDepth(depth[i]);
-    }
-    return isNan == 0;
-}
-
-// Copies `count` pixels of a channel, from pixel `first` of its plane on, in the form in which they travel. `hasBytes`:
-// the colour has 8 bits a channel. Returns false if a colour is not finite, an alpha is not within [0, 1], or a depth
-// is NaN.
-inline bool copyAndCheck(const ConstPlanes& planes, bool hasBytes, std::size_t channel, std::ptrdiff_t first, int count,
-                         std::byte* out)
-{
-    if (channel == Color && hasBytes) {
-        std::memcpy(out, planes.at[Color] + 4 * first, 4 * static_cast<std::size_t>(count));
-        return true;
-    }
-    if (channel == Color) {
-        const float* rgba = floatsOf(planes.at[Color]) + 4 * first;
-        return DFB_FASTEST(copyAndCheckColors, copyAndCheckColorsAvx2, rgba, count, floatsOf(out));
-    }
-    if (channel == Depth) {
-        const float* depth = floatsOf(planes.at[Depth]) + first;
-        return fastest<copyAndCheckDepths>(depth, count, floatsOf(out));
-    }
-    const auto bytes = static_cast<std::ptrdiff_t>(4 * channelWords[channel]);
-    std::memcpy(out, planes.at[channel] + bytes * first, static_cast<std::size_t>(bytes * count));
-    return true;
-}
 
 // Faults in the pixels of an input.
 struct InputFaults {
@@ -485,7 +214,36 @@ struct PixelsInPlace {
     }
 };
 
-inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) const
+} // namespace detail
+
+DFB_NAMESPACE_END
+
+#if DFB_HAS_BODIES
+#include <dfb/wire/wire_kernels.hpp>
+
+DFB_NAMESPACE_BEGIN
+namespace detail {
+
+DFB_COMPILED_ONCE std::uint64_t Activity::bits(const RowPlace& pixels, const RowPlace& ahead, int count,
+                                               std::uint64_t& nanDepths) const
+{
+    const bool hasLimit = pixels.depth && depthLimit < std::numeric_limits<float>::infinity();
+    if (byDepth || hasBytes)
+        ahead.prefetchAll(count, colorBytes());
+    else
+        ahead.prefetchDepth(count); // activePixelBits() loads the colours
+    const DepthBits depths = byDepth || hasLimit ? depthBits(pixels.depth, count, depthLimit) : DepthBits();
+    if (byDepth) {
+        for (std::uint64_t nan = depths.nan; nan != 0; nan &= nan - 1)
+            ++nanDepths;
+        return depths.active;
+    }
+    const std::uint64_t colors = hasBytes ? activeByteBits(pixels.color, count)
+                                          : activePixelBits(floatsOf(pixels.color), floatsOf(ahead.color), count);
+    return hasLimit ? colors & (depths.active | depths.nan) : colors;
+}
+
+DFB_COMPILED_ONCE void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) const
 {
     row.active.clear();
     if (y < valid.y0 || y >= valid.y1)
@@ -528,5 +286,5 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
 }
 
 } // namespace detail
-
 DFB_NAMESPACE_END
+#endif

@@ -11,6 +11,7 @@
 #include <dfb/tile_layout.hpp>
 #include <dfb/wire/sparse_planes.hpp>
 #include <dfb/wire/wire_format.hpp>
+#include <dfb/wire/wire_kernels.hpp>
 
 #include <algorithm>
 #include <cmath>

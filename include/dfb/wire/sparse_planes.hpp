@@ -16,6 +16,7 @@
 #include <dfb/compiled.hpp>
 #include <dfb/fragment.hpp>
 #include <dfb/wire/active_pixels.hpp>
+#include <dfb/wire/wire_kernels.hpp>
 
 #include <algorithm>
 #include <array>

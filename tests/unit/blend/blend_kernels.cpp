@@ -2,6 +2,7 @@
 // equals over(), layer by layer and pixel by pixel.
 #include "catch.hpp"
 
+#include <dfb/blend/compositing.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/adversarial.hpp>
 

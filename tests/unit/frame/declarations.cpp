@@ -149,12 +149,12 @@ TEST_CASE("Manifests and answers that cannot be are refused", "[declarations]")
         return "fine";
     };
     const auto receive = [&](int tile) {
-        dfb::detail::ByteWriter manifest;
+        dfb::detail::SmallBytes manifest;
         manifest.put(static_cast<std::int32_t>(tile));
         manifest.put(std::uint32_t{7});
         manifest.put(std::uint16_t{0});
         return outcome(
-            [&] { owner.receive(1, dfb::detail::ByteReader(manifest.bytes()), [](int t) { return ownerOf(t) == 0; }); });
+            [&] { owner.receive(1, dfb::detail::ByteReader(manifest), [](int t) { return ownerOf(t) == 0; }); });
     };
     CHECK(receive(4).find("tile of another owner") != std::string::npos);
     CHECK(receive(3) == "fine");

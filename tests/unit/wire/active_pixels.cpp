@@ -2,6 +2,7 @@
 #include "catch.hpp"
 
 #include <dfb/wire/active_pixels.hpp>
+#include <dfb/wire/wire_kernels.hpp>
 
 #include <algorithm>
 #include <cmath>

@@ -6,6 +6,7 @@
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/adversarial.hpp>
 #include <dfb/wire/wire_format.hpp>
+#include <dfb/wire/wire_kernels.hpp>
 
 #if defined(DFB_HAS_SNAPPY)
 #include <dfb/comm/snappy_codec.hpp>
