@@ -75,7 +75,8 @@ public:
     // has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have not sent all of it,
     // because it failed or was partial, or if a display has dropped it; MalformedMessage if a part of it cannot be
     // right. The displays then keep their picture. Throws TransportError if the connection fails, and InvalidArgument
-    // on a thread that may not call MPI, or for a frame that is not later than the last.
+    // on a thread that may not call MPI, or for a frame that is not later than the last or that no rank can
+    // have begun.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before
@@ -87,17 +88,12 @@ public:
     // that calls finish() may call it.
     std::int64_t imageFrame() const noexcept;
 
-    // ToWall calls these: begin() in each begin() of the framebuffer, put() from any thread.
-    void begin();
-    void put(const PixelTile& tile);
-
 private:
+    friend struct ToWall;
+
     WallLayout layout_;
     std::unique_ptr<detail::Wall> wall_;
 };
-
-inline void ToWall::newFrame(const NoFrameData&) { wall->begin(); }
-inline void ToWall::process(PixelTile& tile) const { wall->put(tile); }
 
 static_assert(is_pixel_op_v<ToWall>);
 
@@ -125,8 +121,9 @@ DFB_COMPILED_ONCE void DisplayWall::finish(std::int64_t frame, std::chrono::mill
 }
 DFB_COMPILED_ONCE const Image& DisplayWall::image(int display) const { return wall_->image(display); }
 DFB_COMPILED_ONCE std::int64_t DisplayWall::imageFrame() const noexcept { return wall_->imageFrame(); }
-DFB_COMPILED_ONCE void DisplayWall::begin() { wall_->begin(); }
-DFB_COMPILED_ONCE void DisplayWall::put(const PixelTile& tile) { wall_->put(tile); }
+
+DFB_COMPILED_ONCE void ToWall::newFrame(const NoFrameData&) { wall->wall_->begin(); }
+DFB_COMPILED_ONCE void ToWall::process(PixelTile& tile) const { wall->wall_->put(tile); }
 
 DFB_NAMESPACE_END
 #endif

@@ -96,7 +96,7 @@ public:
     // fails on all ranks.
     ~ImageCompositor()
     {
-        if (isOpen_)
+        if (engine_->isOpen())
             engine_->leave();
     }
 
@@ -137,9 +137,10 @@ public:
     // Moves messages if no thread does. Waits for nothing. Throws InvalidArgument on a thread that may not call MPI.
     bool isDone()
     {
-        if (isOpen_)
-            engine_->requireProgress();
-        return isOpen_ && engine_->isDone();
+        if (!engine_->isOpen())
+            return false;
+        engine_->requireProgress();
+        return engine_->isDone();
     }
 
     // Ends the picture. Collective. Waits until it is complete on the display rank, or has failed. Throws FrameError,
@@ -186,7 +187,7 @@ private:
     std::shared_ptr<Connection> connection_;
     std::shared_ptr<ThreadExecutor> oneThread_; // made here, for a rank with one processor
     ImageBlend blend_;
-    bool bottomUp_ = false, isOpen_ = false;
+    bool bottomUp_ = false;
     std::unique_ptr<detail::Operations> operations_;
     std::unique_ptr<detail::Engine> engine_;
     std::vector<TileInput> inputs_;
@@ -417,7 +418,7 @@ DFB_COMPILED_ONCE TileOwners ImageCompositor::findOwners()
 
 DFB_COMPILED_ONCE void ImageCompositor::resize(int width, int height)
 {
-    if (isOpen_)
+    if (engine_->isOpen())
         detail::failArgument("resize() while a picture is open: end() it first");
     FrameBufferConfig config = engine_->config();
     config.image.width = width;
@@ -428,7 +429,7 @@ DFB_COMPILED_ONCE void ImageCompositor::resize(int width, int height)
 
 DFB_COMPILED_ONCE void ImageCompositor::begin(const FrameConfig& frame)
 {
-    if (isOpen_)
+    if (engine_->isOpen())
         detail::failArgument("start() while a picture is open: end() it first");
     FrameConfig declared = frame;
     declared.passes = 1;
@@ -439,7 +440,6 @@ DFB_COMPILED_ONCE void ImageCompositor::begin(const FrameConfig& frame)
     if (declared.maxLayers == 0)
         declared.maxLayers = size();
     engine_->begin(declared, [] {});
-    isOpen_ = true;
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::startFailed(const std::exception_ptr& why, const FrameConfig& frame)
@@ -479,10 +479,9 @@ DFB_COMPILED_ONCE FrameReport ImageCompositor::composite(const InputImage& image
 
 DFB_COMPILED_ONCE FrameReport ImageCompositor::end()
 {
-    if (!isOpen_)
+    if (!engine_->isOpen())
         detail::failArgument("end() without start()");
     engine_->requireProgress();
-    isOpen_ = false;
     FrameReport report = engine_->end();
     regions_ = std::exchange(report.figures, {});
     return report;

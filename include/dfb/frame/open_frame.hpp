@@ -1,11 +1,10 @@
 // OpenFrame: the frame that is open on this rank, as a state machine (drawn in docs/architecture.md): its states, who
 // causes a transition, what belongs to it, and what it still waits for.
 //
-// The thread that is in begin() or end() calls open(), finish() and close(). Any thread calls fail(), for a failure of
-// this rank, and failElsewhere(), for one that another rank has reported. Any thread calls vote() when it may have
-// brought about the last thing to wait for. The thread that takes the result of the vote calls decide(). close() is
-// right in every state: if the transport has failed, so that no verdict comes, it is called in Voted or an earlier
-// state.
+// The thread that is in begin() or end() calls open(), finish() and close(). Any thread calls fail(). Any thread calls
+// vote() when it may have brought about the last thing to wait for. The thread that takes the result of the vote calls
+// decide(). close() is right in every state: if the transport has failed, so that no verdict comes, it is called in
+// Voted or an earlier state.
 #pragma once
 
 #include <dfb/comm/message.hpp>
@@ -77,10 +76,10 @@ public:
     }
 
     struct Failure {
-        bool isFirst = false; // nobody has told the other ranks yet
+        bool isFirst = false; // the other ranks must be told
         bool inTime = false;  // this rank's vote will say so
     };
-    // Fails the frame because of an error on this rank. The first reason counts.
+    // Fails the frame because of an error on this rank, or on one that has told all others. The first reason counts.
     Failure fail(const ErrorInfo& info)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -88,13 +87,6 @@ public:
         result.isFirst = !std::exchange(isTold_, true);
         result.inTime = failNow(info);
         return result;
-    }
-    // Fails the frame because another rank says so. That rank has told all.
-    void failElsewhere(const ErrorInfo& info)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        isTold_ = true;
-        failNow(info);
     }
     // Notes that something was lost, but the frame goes on. Returns whether this rank's vote will say so: not if it has
     // voted already.

@@ -270,7 +270,7 @@ private:
                 mine = missing(info.kind);  // this rank's part of the text
             info.tile = info.expected = -1; // weighs less than the list in its sender's own vote
         }
-        frame_.failElsewhere(mine && Verdict::weight(*mine) > Verdict::weight(info) ? *mine : info);
+        frame_.fail(mine && Verdict::weight(*mine) > Verdict::weight(info) ? *mine : info);
         dropRest(info.kind);
         tryVote();
     }

@@ -36,7 +36,6 @@ const std::vector<std::pair<const char*, std::function<void(OpenFrame&)>>> event
     {"open", [](OpenFrame& f) { f.open(); }},
     {"finish", [](OpenFrame& f) { f.finish(); }},
     {"fail", [](OpenFrame& f) { f.fail(errorOf(dfb::ErrorKind::UserCode)); }},
-    {"fail elsewhere", [](OpenFrame& f) { f.failElsewhere(errorOf(dfb::ErrorKind::UserCode)); }},
     {"note", [](OpenFrame& f) { f.note(errorOf(dfb::ErrorKind::UserCode)); }},
     {"vote, done", [](OpenFrame& f) { f.vote(yes, yes); }},
     {"vote, not done", [](OpenFrame& f) { f.vote(no, yes); }},
@@ -76,24 +75,20 @@ TEST_CASE("Every event in every state leads to the state that the drawing shows"
         std::vector<S> to; // by event
     };
     const std::vector<Row> rows{
-        // open        finish       fail         elsewhere    note          done         not done      may not
-        //     decide      close
+        // open        finish       fail         note          done         not done      may not       decide
+        //     close
         {S::Closed,
-         {S::Rendering, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed,
-          S::Closed}},
+         {S::Rendering, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed}},
         {S::Rendering,
-         {S::Rendering, S::Finishing, S::Failed, S::Failed, S::Rendering, S::Rendering, S::Rendering, S::Rendering,
-          S::Rendering, S::Closed}},
+         {S::Rendering, S::Finishing, S::Failed, S::Rendering, S::Rendering, S::Rendering, S::Rendering, S::Rendering,
+          S::Closed}},
         {S::Finishing,
-         {S::Finishing, S::Finishing, S::Failed, S::Failed, S::Finishing, S::Voted, S::Finishing, S::Finishing,
-          S::Finishing, S::Closed}},
-        {S::Failed,
-         {S::Failed, S::Failed, S::Failed, S::Failed, S::Failed, S::Voted, S::Voted, S::Failed, S::Failed, S::Closed}},
-        {S::Voted,
-         {S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Decided, S::Closed}},
+         {S::Finishing, S::Finishing, S::Failed, S::Finishing, S::Voted, S::Finishing, S::Finishing, S::Finishing,
+          S::Closed}},
+        {S::Failed, {S::Failed, S::Failed, S::Failed, S::Failed, S::Voted, S::Voted, S::Failed, S::Failed, S::Closed}},
+        {S::Voted, {S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Decided, S::Closed}},
         {S::Decided,
-         {S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided,
-          S::Closed}}};
+         {S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Closed}}};
     REQUIRE(rows.size() == 6);
     for (const Row& row : rows) {
         REQUIRE(row.to.size() == events.size());
@@ -132,9 +127,6 @@ TEST_CASE("What a failure says depends on whether this rank has voted, and who w
     CHECK(frame.failed()); // until the next frame
     frame.open();
     CHECK((!frame.failed() && !frame.isDamaged() && !frame.reason()));
-
-    frame.failElsewhere(errorOf(dfb::ErrorKind::UserCode)); // that rank has told all
-    CHECK_FALSE(frame.fail(errorOf(dfb::ErrorKind::UserCode)).isFirst);
     frame.close(noHelp);
 
     frame.open(); // a failure after the vote only stops this rank's work
