@@ -45,8 +45,8 @@ public:
     using TileFrameData = typename Operations::TileFrameData;
     using PixelFrameData = typename Operations::PixelFrameData;
 
-    // A frame that has begun. If it is destroyed without end(), the frame fails on all ranks, and the destructor waits
-    // until all ranks have ended it.
+    // A frame that has begun. If it is destroyed without end(), the frame fails on all ranks (after isDone() it may
+    // also end well), and the destructor waits until all ranks have ended it.
     class [[nodiscard]] Frame {
     public:
         Frame(Frame&& other) noexcept

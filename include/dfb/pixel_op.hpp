@@ -19,8 +19,10 @@
 #include <dfb/base/detect.hpp>
 #include <dfb/tile_op.hpp>
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <type_traits>
 #include <utility>
 
@@ -90,7 +92,7 @@ struct ToneMap {
             float* p = tile.color + 4 * i;
             const float alpha = p[3] > 0.0f ? p[3] : 1.0f;
             for (int c = 0; c < 3; ++c) {
-                const float k = exposure_ * p[c];
+                const float k = std::min(exposure_ * p[c], std::numeric_limits<float>::max()); // infinity becomes alpha
                 p[c] = alpha * (k / (alpha + k));
             }
         }

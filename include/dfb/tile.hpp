@@ -26,7 +26,9 @@ struct TileHeader {
     int children = 0;         // how many inputs of generation + 1 this one announces
     std::uint32_t source = 0; // brick id, or another number; where there are no bricks, the rank
     std::uint16_t part = 0;   // to tell apart several inputs of one source
-    int sample = 0;           // sample number over all frames that accumulate: the index to seed with; set by start
+    // For renderers: the sample number over all frames that accumulate, to seed with. Set by Frame::start; 0 in the
+    // inputs of a tile operation, which has TileInfo::firstSample.
+    int sample = 0;
 };
 
 // An order of the sources of inputs, from front to back.

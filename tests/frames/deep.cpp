@@ -166,6 +166,22 @@ struct Deep {
                                   + std::to_string(report.mergeErrorBound));
             }
         }
+
+        // The bound counts as long as the frame is in the image.
+        dfb::DistributedFrameBuffer<dfb::Progressive<dfb::BasicDeepBlend<16>>, dfb::NoPixelOp, Transport> means(
+            communicator, configOf(size, 2));
+        std::vector<double> bounds;
+        for (const auto& [accumulationId, segments] :
+             {std::pair(1, 1), std::pair(1, Interleaved::slots), std::pair(2, Interleaved::slots)}) {
+            params.accumulationId = static_cast<std::uint64_t>(accumulationId);
+            bounds.push_back(dfb::DeepParallelLoop(means, world, segments)
+                                 .render(
+                                     scene::FlatCamera(),
+                                     [&](const dfb::Brick& b, dfb::DeepTile& deep) { scene.render(b, deep, false); },
+                                     params)
+                                 .mergeErrorBound);
+        }
+        result.expect(bounds[0] > 0 && bounds[1] == bounds[0] && bounds[2] == 0, "the bound of a mean");
         return result;
     }
 };

@@ -103,6 +103,8 @@ public:
         mailbox_->connection().throwIfFailed();
         const bool haveMoved = pipeline_->table().prepare(params.owners);
         params_ = params;
+        if (!start.goesOn)
+            mergeErrorBound_ = 0;
         declarations_.newFrame(!lastFailed, haveMoved); // after a failed frame, owners may know of different ones
 
         std::exception_ptr userError; // thrown by copying the data, or by the pixel operation's newFrame()
@@ -326,21 +328,22 @@ public:
         report.progress =
             connection.needsCaller() && !connection.hasProgressThread() ? Progress::Caller : Progress::Thread;
         verdict.addTo(report);
+        // Like wireErrorBound, it also bounds what the image keeps from earlier frames.
+        report.mergeErrorBound = mergeErrorBound_ = std::max(mergeErrorBound_, report.mergeErrorBound);
         return report;
     }
 
-    // Closes a frame that is left without end(), mostly while an exception passes.
+    // Ends a frame that is left without end(), mostly while an exception passes.
     void leave() noexcept override
     {
-        const EndOfFrame ending{*this};
         try {
-            if (!outcome_->failed())
+            if (!outcome_->failed()) // has no effect if isDone() has let this rank vote
                 outcome_->failWhole(errorInfo(ErrorKind::Cancelled,
                                               "the frame was left without end(). If by an exception: Frame::guard() "
                                               "around what throws tells all ranks its text"));
-            outcome_->conclude();
-        } catch (const TransportError&) {
-            // The next begin() throws it.
+            end();
+        } catch (...) {
+            // A FrameError, which says what failWhole() was told, or a TransportError, which the next begin() throws.
         }
     }
 
@@ -776,6 +779,7 @@ private:
     std::optional<JobExchange> jobs_;
     FrameConfig params_;
     Accumulation accumulation_;
+    double mergeErrorBound_ = 0; // of this frame and those that it continues
     FrameFigures figures_;
     Compression compression_;
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank

@@ -80,6 +80,7 @@ public:
     void newFrame(std::int64_t frame, const FrameConfig& params, Accumulation::Start start, bool haveMoved,
                   bool compresses)
     {
+        const FloatEnvironment floatEnvironment;
         faults_.reset();
         promises_.clear();
         reports_ = {
@@ -218,7 +219,9 @@ public:
         parts.colorFormat = tile.hasBytes ? WireFormat::Bytes : WireFormat::Float32;
         parts.inPlace = inPlace(tile);
         parts.faults = &faults_;
-        return Fragment(tile, Buffer(), parts);
+        TileHeader header = tile;
+        header.sample = 0; // as in an input that comes in a message
+        return Fragment(header, Buffer(), parts);
     }
 
     // Remembers the checksum of a tile whose pixels must stay as they are. Several threads may call it.
@@ -309,6 +312,7 @@ public:
     {
         if (!traits().pixelOpIsPointwise)
             return;
+        const FloatEnvironment floatEnvironment;
         const float depth = std::numeric_limits<float>::infinity();
         PixelTile pixel;
         pixel.frame = table_.frameInfo().frame;
@@ -323,6 +327,7 @@ public:
     // On the display rank, when all tiles are there: fills in those that nobody touched.
     void fillBackground()
     {
+        const FloatEnvironment floatEnvironment;
         gather_.fillBackground(background_, [this](int tile) { return table_.samples(tile).count == 0; });
     }
 

@@ -304,7 +304,7 @@ private:
         bool spoilt = false;  // an input contradicted others, or the op refused it; even after `finished`
         bool counted = false; // whether declare() has counted the tile
         std::vector<DependencyTracker> trees; // one per pass
-        std::unique_ptr<TileStage> op;        // made with the slot
+        std::unique_ptr<TileStage> op;        // null only in a tile that is spoilt
         BackgroundPixels background;
     };
 
@@ -349,18 +349,15 @@ private:
         return slot;
     }
 
-    // Returns the slot, set up for this frame. The first call in a frame throws the exceptions of the op's newFrame():
-    // then the tile is spoilt.
+    // Returns the slot, set up for this frame. The first call in a frame throws the exceptions of the op's constructor
+    // and of its newFrame(): then the tile is spoilt.
     Slot& slotFor(int tile)
     {
         auto& slot = slotOf(tile);
         if (!slot)
             slot = takeSpare();
-        if (!slot) {
-            auto made = std::make_unique<Slot>();
-            made->op = operations_.makeTile();
-            slot = std::move(made);
-        }
+        if (!slot)
+            slot = std::make_unique<Slot>();
         if (slot->frame != info_.frame) {
             const bool isEmptyYet = goesOn(tile) && !hasSamples(tile);
             slot->frame = info_.frame;
@@ -379,6 +376,8 @@ private:
             info.firstSample = samples(tile).first;
             info.emptySamples = isEmptyYet ? info.firstSample : 0;
             try {
+                if (!slot->op)
+                    slot->op = operations_.makeTile();
                 slot->op->newFrame(info);
             } catch (...) {
                 slot->spoilt = true; // the op is of no use in this frame

@@ -323,9 +323,11 @@ struct Verdict {
         if (a.differing.empty())
             a.differing = !b.differing.empty() ? b.differing : a.terms.difference(b.terms);
         // Other errors follow from different parameters. But if a camera throws on one rank, that is why its
-        // FrameConfig::order is missing.
-        const bool isCause = a.error && a.error->kind == ErrorKind::UserCode && a.terms.allowPartial == 0;
-        if (!a.differing.empty() && !isCause)
+        // FrameConfig::order is missing. Then there is no partial image, either.
+        const bool isCause = a.error && a.error->kind == ErrorKind::UserCode;
+        if (!a.differing.empty() && isCause && a.terms.allowPartial != 0)
+            a.differing += printed("; rank %d: %s", a.error->rank, a.error->message.c_str());
+        if (!a.differing.empty() && (!isCause || a.terms.allowPartial != 0))
             a.error = disagreement(a.differing);
         using Words = std::array<std::uint64_t, sizeof(Sums) / 8>;
         auto sums = loadAs<Words>(reinterpret_cast<const std::byte*>(&a.sums));

@@ -15,6 +15,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -58,6 +59,9 @@ public:
                 failArgument("frame %lld, after the wall has finished frame %lld: frames are finished in order, once, "
                              "and all those of a wall are of one framebuffer, before its resize()",
                              static_cast<long long>(frame), static_cast<long long>(last_));
+            if (frame > lastPossible())
+                failArgument("frame %lld, which no rank can have begun: was it one of this wall's framebuffer?",
+                             static_cast<long long>(frame));
         }
         const Connection::Expecting expecting(mailbox_->connection());
         std::optional<std::chrono::steady_clock::time_point> deadline;
@@ -70,8 +74,7 @@ public:
         SmallBytes missing; // empty if nothing is missing
         if (mine)
             detail::put(missing, *mine);
-        const Bytes all =
-            mailbox_->reduce(missing, [](const Bytes& a, const Bytes& b) { return a.empty() ? b : a; });
+        const Bytes all = mailbox_->reduce(missing, [](const Bytes& a, const Bytes& b) { return a.empty() ? b : a; });
         const std::lock_guard<std::mutex> lock(mutex_);
         if (const auto done = coming_.find(frame); done != coming_.end() && all.empty())
             for (auto& [display, picture] : *done->second)
@@ -178,8 +181,9 @@ private:
         };
         if (isTooLarge(layout_.columns, layout_.displayWidth, layout_.bezelX)
             || isTooLarge(layout_.rows, layout_.displayHeight, layout_.bezelY) || layout_.columns < 1
-            || layout_.rows < 1 || layout_.displayWidth < 1 || layout_.displayHeight < 1 || layout_.bezelX < 0
-            || layout_.bezelY < 0 || format_ == OutputFormat::None)
+            || layout_.rows < 1 || std::int64_t{layout_.columns} * layout_.rows > std::numeric_limits<int>::max()
+            || layout_.displayWidth < 1 || layout_.displayHeight < 1 || layout_.bezelX < 0 || layout_.bezelY < 0
+            || format_ == OutputFormat::None)
             failArgument("a wall of %dx%d displays of %dx%d, bezels of %dx%d, format %s: cannot be", layout_.columns,
                          layout_.rows, layout_.displayWidth, layout_.displayHeight, layout_.bezelX, layout_.bezelY,
                          nameOf(format_));

@@ -99,7 +99,7 @@ public:
                 isOrthographic_ ? 0
                                 : unit * (1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) + 1e-7 * largest),
                 {0.5 * width * (1 + rows_[0].at(p) / depth), 0.5 * height * (1 - rows_[1].at(p) / depth)},
-                5e-7 * largest * pixels / depth};
+                (5e-7 * largest + (isOrthographic_ ? 0 : 2e-7 * unit * dot(d, d) / depth)) * pixels / depth};
         });
     }
 

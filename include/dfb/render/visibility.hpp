@@ -251,7 +251,7 @@ DFB_COMPILED_ONCE Footprint projectBox(const Box3& bounds, const Pose& pose, int
                           1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) + 1e-7 * largest,
                           {0.5 * width + shiftX + pixelsPerUnit * dot(d, pose.right) / depth,
                            0.5 * height - pixelsPerUnit * dot(d, pose.up) / depth},
-                          5e-7 * largest / depth * pixelsPerUnit,
+                          (5e-7 * largest + 2e-7 * dot(d, d) / depth) / depth * pixelsPerUnit,
                           pixelsPerUnit * lensRadius * std::fabs(1 / depth - 1 / focusDistance)};
     });
 }

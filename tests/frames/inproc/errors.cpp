@@ -18,6 +18,7 @@
 #include <memory>
 #include <mutex>
 #include <numeric>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <thread>
@@ -914,6 +915,39 @@ TEST_CASE("A frame left without end() is cancelled on every rank", "[errors]")
         }
 }
 
+TEST_CASE("A frame that is left when all is done ends for the rank that leaves it, too", "[errors]")
+{
+    for (const bool partial : {false, true}) {
+        std::vector<float> mean(2, 0.0f);
+        dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+            using Framebuffer = FrameBuffer<dfb::Progressive<dfb::ImageParallel>>;
+            dfb::FrameBufferConfig config(128, 64, dfb::OutputFormat::RGBA32F);
+            Framebuffer fb(communicator, config);
+            dfb::ImageParallelLoop loop(fb);
+            dfb::FrameConfig params;
+            params.allowPartial = partial;
+            for (int i = 0; i < 3; ++i) { // the samples 1, 2, 3
+                auto frame = loop.start(
+                    [](auto& tile) {
+                        const auto value = static_cast<float>(tile.sample + 1);
+                        tile.fill({value, value, value, 1});
+                    },
+                    params);
+                while (!frame.isDone())
+                    std::this_thread::yield();
+                if (i == fb.rank()) {
+                    const auto left = std::move(frame);
+                } else {
+                    frame.end();
+                }
+            }
+            if (fb.isDisplayRank())
+                mean = {fb.image().rgba32f()[0], fb.image().rgba32f()[std::size_t{4} * 64]};
+        });
+        CHECK(mean == std::vector<float>{2, 2});
+    }
+}
+
 TEST_CASE("Frames that all ranks leave, many times over", "[errors]")
 {
     const Scene s = scene::makeScene(6);
@@ -1511,6 +1545,79 @@ TEST_CASE("Ranks that began a partial frame differently disagree, whatever else 
     CHECK(allSame(texts));
     CHECK(has(texts[0], "FrameError: dfb: ranks disagree"));
     CHECK(has(texts[0], "then fine"));
+}
+
+namespace {
+
+struct ThrowingEye : dfb::PerspectiveCamera {
+    bool throws = false;
+
+    explicit ThrowingEye(bool isCulprit) : PerspectiveCamera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 40), throws(isCulprit) {}
+    std::optional<dfb::Vec3> commonEye() const
+    {
+        if (throws)
+            throw std::runtime_error("no such eye");
+        return eye();
+    }
+};
+
+// Its first object cannot be made.
+struct MadeLate : dfb::AlphaBlend {
+    static inline std::atomic<bool> fails{false};
+
+    MadeLate()
+    {
+        if (fails.exchange(false))
+            throw std::runtime_error("not yet");
+    }
+};
+
+} // namespace
+
+TEST_CASE("A camera that throws on one rank is why a frame fails, also if it may be partial", "[errors]")
+{
+    std::vector<std::string> texts(3);
+    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<dfb::AlphaBlend> fb(communicator, {128, 64});
+        const auto z = static_cast<float>(fb.rank());
+        const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, z}, {1, 1, z}}}});
+        const dfb::SharedWorld all(fb, world);
+        dfb::DataParallelLoop loop(fb, world, all);
+        dfb::FrameConfig params;
+        params.allowPartial = true;
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+            loop.render(
+                ThrowingEye(fb.rank() == 1), [](const dfb::Brick&, auto&) {}, params);
+        });
+    });
+    INFO(joined(texts));
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "rank 1: "));
+    CHECK(has(texts[0], "no such eye"));
+}
+
+TEST_CASE("Of a partial frame only the tile is lost whose operation cannot be made", "[errors]")
+{
+    std::vector<std::int64_t> incomplete;
+    dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<MadeLate> fb(communicator, {512, 64});
+        const dfb::World world({{0, {{-9, -1, -1}, {9, 1, 1}}}});
+        const dfb::PerspectiveCamera camera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 10);
+        dfb::DataParallelLoop loop(fb, world);
+        dfb::FrameConfig params;
+        params.allowPartial = true;
+        for (const bool fails : {true, false}) {
+            MadeLate::fails = fails;
+            const auto report = loop.render(
+                camera,
+                [](const dfb::Brick&, auto& tile) {
+                    tile.fill({1, 1, 1, 1}, 1);
+                },
+                params);
+            incomplete.push_back(report.tilesIncomplete);
+        }
+    });
+    CHECK(incomplete == std::vector<std::int64_t>{1, 0});
 }
 
 TEST_CASE("An operation that takes longer than a frame may fails the frame, not the framebuffer", "[errors]")

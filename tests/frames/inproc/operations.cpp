@@ -246,6 +246,12 @@ TEST_CASE("ToneMap keeps emission and alpha", "[operations]")
     CHECK(dfb::testing::ulpsBetween(pixels[4], 2.0f / 3) <= 4);
     CHECK(pixels[7] == 0.0f);
     CHECK(pixels[8] == 0.0f);
+    // An infinite colour becomes alpha, which is the limit of the curve.
+    const float infinity = std::numeric_limits<float>::infinity();
+    pixels = {3e38f, infinity, 0, 0.5f};
+    tile = {0, {0, 0, 1, 1}, pixels.data(), nullptr};
+    op.process(tile);
+    CHECK(pixels == std::vector<float>{0.5f, 0.5f, 0, 0.5f});
 }
 
 TEST_CASE("PixelOpChain runs the first, then the second, each with its data", "[operations]")

@@ -218,6 +218,27 @@ TEST_CASE("The longest of all times is none that a wall's end of frame exceeds",
     CHECK(texts == fine);
 }
 
+TEST_CASE("A frame that no rank can have begun is refused, and the wall goes on", "[wall]")
+{
+    std::vector<std::string> texts(2), after(2);
+    board::runOn(std::make_shared<Board>(), 2, [&](const BoardTransport::Communicator& communicator) {
+        const auto connection = dfb::connect<BoardTransport>(communicator);
+        dfb::DisplayWall wall(connection, {2, 1, 64, 64, 0, 0, {0, 1}}, dfb::OutputFormat::RGBA8);
+        FrameBuffer fb(connection, wall.frameBufferConfig(), {&wall});
+        const auto rank = static_cast<std::size_t>(fb.rank());
+        texts[rank] = outcomeOf([&] { wall.finish(1000); });
+        after[rank] = outcomeOf([&] {
+            const auto report =
+                dfb::DataParallelLoop(fb, dfb::World()).render(scene::FlatCamera(), [](const dfb::Brick&, auto&) {});
+            wall.finish(report.frame);
+        });
+    });
+    INFO(joined(texts) << joined(after));
+    CHECK(has(texts[0], "frame 1000, which no rank can have begun"));
+    CHECK(has(texts[1], "frame 1000, which no rank can have begun"));
+    CHECK(after == fine);
+}
+
 TEST_CASE("Ranks with different pools make no wall", "[wall]")
 {
     std::vector<std::string> texts(2);

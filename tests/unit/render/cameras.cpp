@@ -149,6 +149,30 @@ TEST_CASE("No ray of any camera meets a box in a tile that its projection leaves
     checkAll(dfb::MatrixCamera(inside.at, projections[1].at), 9, 0.6);
 }
 
+TEST_CASE("The angle of view may be nearly 180 degrees", "[cameras]")
+{
+    const int width = 65536, height = 1000; // across the image, 179.85 and 179.99 degrees
+    std::mt19937_64 random(1);
+    std::size_t missed = 0;
+    for (const float fovY : {170.0f, 179.0f}) {
+        const auto camera = dfb::PerspectiveCamera::along(eye, view, up, fovY);
+        for (int i = 0; i < 4000; ++i) {
+            const double x = uniform(random, 0, 8), y = uniform(random, 0, height); // at the border
+            const dfb::Ray ray = camera.ray(x, y, width, height);
+            const dfb::Vec3 at = ray.origin + static_cast<float>(uniform(random, 0.1, 100)) * ray.direction;
+            // One ulp each way has the exact point, as the coordinates are rounded twice.
+            const auto next = [](const dfb::Vec3& p, float to) {
+                return dfb::Vec3{std::nextafter(p.x, to), std::nextafter(p.y, to), std::nextafter(p.z, to)};
+            };
+            const float infinity = std::numeric_limits<float>::infinity();
+            const dfb::Footprint seen = camera.project({next(at, -infinity), next(at, infinity)}, width, height);
+            const int px = static_cast<int>(x), py = static_cast<int>(y);
+            missed += !seen.meets({px, py, px + 1, py + 1});
+        }
+    }
+    CHECK(missed == 0);
+}
+
 TEST_CASE("No ray meets a box as small as roundings of the eye in a tile that its projection leaves out", "[cameras]")
 {
     Random random(12);
