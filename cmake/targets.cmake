@@ -25,6 +25,7 @@ find_package(Threads REQUIRED)
 _dfb_add_component(core)
 target_compile_features(dfb_core INTERFACE cxx_std_17)
 target_include_directories(dfb_core INTERFACE $<BUILD_INTERFACE:${PROJECT_SOURCE_DIR}/include>)
+target_compile_definitions(dfb_core INTERFACE DFB_COMPONENTS) # the headers look for no dependency by themselves
 target_link_libraries(dfb_core INTERFACE Threads::Threads)
 
 _dfb_add_component(strict_fp)

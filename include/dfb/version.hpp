@@ -14,8 +14,9 @@
 #define DFB_NAMESPACE_END } }
 // clang-format on
 
-// MPI is used where the CMake target dfb::mpi is linked, and where the compiler finds mpi.h by itself, as mpicxx does.
-#if !defined(DFB_HAS_MPI) && !defined(DFB_COMPILED) && defined(__has_include)
+// MPI is used where the CMake target dfb::mpi is linked. Without CMake's targets and pkg-config, which define
+// DFB_COMPONENTS, it is used where the compiler finds mpi.h by itself, as mpicxx does.
+#if !defined(DFB_HAS_MPI) && !defined(DFB_COMPONENTS) && !defined(DFB_COMPILED) && defined(__has_include)
 #if __has_include(<mpi.h>)
 #define DFB_HAS_MPI 1
 #endif

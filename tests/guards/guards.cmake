@@ -53,7 +53,7 @@ endif()
 # that component, the umbrella header with each set of components, and all others with only our include folder. Function
 # bodies that dfb::compiled compiles once are read if the header itself has some. Elsewhere they would double the time.
 function(_dfb_flags_of out target)
-  set(folders "$<TARGET_PROPERTY:${target},INTERFACE_INCLUDE_DIRECTORIES>")
+  set(folders "$<$<TARGET_EXISTS:${target}>:$<TARGET_PROPERTY:${target},INTERFACE_INCLUDE_DIRECTORIES>>")
   set(${out} "$<$<BOOL:${folders}>:-idirafter$<JOIN:${folders},$<SEMICOLON>-idirafter>>" PARENT_SCOPE)
 endfunction()
 
@@ -110,7 +110,9 @@ list(TRANSFORM _headers REPLACE "(.+)" "#include <\\1>\n" OUTPUT_VARIABLE _inclu
 list(JOIN _include_all "" _include_all)
 file(CONFIGURE OUTPUT all_of_core.cpp CONTENT "${_include_all}" @ONLY)
 add_test(NAME guard.core_dependencies # -M lists what is included, and compiles nothing
-  COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -M -I${_include} ${CMAKE_CURRENT_BINARY_DIR}/all_of_core.cpp)
+  COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -M -DDFB_COMPONENTS -I${_include} "${_mpi_flags}"
+    ${CMAKE_CURRENT_BINARY_DIR}/all_of_core.cpp
+  COMMAND_EXPAND_LISTS)
 set_tests_properties(guard.core_dependencies PROPERTIES LABELS guard
   FAIL_REGULAR_EXPRESSION "/mpi\\.h;/mpicxx\\.h;/snappy[a-z-]*\\.h;/(tbb|oneapi)/[a-z_/]*\\.h")
 

@@ -125,6 +125,16 @@ if(DFB_PKG_CONFIG)
   endif()
 endif()
 
+# Core keeps to itself even where the compiler finds mpi.h.
+if(MPI_CXX_INCLUDE_DIRS)
+  list(JOIN MPI_CXX_INCLUDE_DIRS ":" _path)
+  foreach(_test find_package_core add_subdirectory_core pkg_config_core)
+    if(TEST package.${_test})
+      set_tests_properties(package.${_test} PROPERTIES ENVIRONMENT CPATH=${_path})
+    endif()
+  endforeach()
+endif()
+
 # The component testing, in addition to the requested ones.
 dfb_add_package_test(find_package_testing HOW find_package STAGE stage_testing COMPONENTS testing EXPECT testing
   WITHOUT MPI TBB Snappy)
