@@ -67,8 +67,15 @@ foreach(_how add_subdirectory FetchContent)
     string(TOUPPER ${_component} _upper)
     list(APPEND _options -DDFB_WITH_${_upper}=${DFB_WITH_${_upper}})
   endforeach()
+  if(_how STREQUAL "add_subdirectory")
+    list(APPEND _options -Ddfb_ROOT=${_stage})
+  endif()
   dfb_add_package_test(${_how} HOW ${_how} EXPECT ${_others} OPTIONS ${_options})
 endforeach()
+set_tests_properties(package.add_subdirectory PROPERTIES FIXTURES_REQUIRED dfb_stage)
+# Folders of one project ask for different components.
+list(JOIN _others "," _folders)
+dfb_add_package_test(find_package_folders HOW find_package COMPONENTS core EXPECT ${_others} OPTIONS -DFOLDERS=${_folders})
 
 # Core alone, and each component alone, on a machine that has no other dependency. The frame with core is tested below,
 # with the compiled library; header.dfb compiles it as headers.
