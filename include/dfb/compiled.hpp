@@ -31,14 +31,15 @@
 #define DFB_COMPILED_TEMPLATE(...) static_assert(true)
 #endif
 
-// Either all files of a program use dfb::compiled, or none. This variable is thread_local in files that do not, and
-// ordinary in dfb::compiled: the linker refuses a mixture.
+// Either all files of a program or of a shared library use dfb::compiled, or none. This variable is thread_local in
+// files that do not, and ordinary in dfb::compiled: the linker refuses a mixture. It is hidden, as a library that uses
+// dfb::compiled may be linked with one that does not.
 #if defined(__GNUC__) && defined(__ELF__)
 extern "C" {
 #if defined(DFB_COMPILING)
-int dfb_either_all_files_with_dfb_compiled_or_none = 0;
+__attribute__((visibility("hidden"))) int dfb_either_all_files_with_dfb_compiled_or_none = 0;
 #elif !defined(DFB_COMPILED)
-__attribute__((used, weak)) thread_local int dfb_either_all_files_with_dfb_compiled_or_none = 0;
+__attribute__((used, weak, visibility("hidden"))) thread_local int dfb_either_all_files_with_dfb_compiled_or_none = 0;
 #endif
 }
 #endif

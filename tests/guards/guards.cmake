@@ -144,13 +144,20 @@ target_compile_options(test_odr PRIVATE -Wconversion)
 add_test(NAME guard.odr COMMAND test_odr)
 set_tests_properties(guard.odr PROPERTIES LABELS guard)
 
-# The linker refuses a program of which some files link dfb::compiled and others use the headers alone.
+# The linker refuses a program of which some files link dfb::compiled and others use the headers alone. It accepts shared
+# libraries that differ in this.
 if(NOT DFB_DEVELOP_HEADER_ONLY AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
   add_test(NAME guard.compiled_mixed COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -I${_include}
     ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/headers.cpp ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/compiled.cpp
     $<TARGET_FILE:dfb_compiled> -pthread -o guard_compiled_mixed)
   set_tests_properties(guard.compiled_mixed PROPERTIES LABELS guard
     PASS_REGULAR_EXPRESSION "dfb_either_all_files_with_dfb_compiled_or_none: TLS definition")
+  add_test(NAME guard.compiled_apart
+    COMMAND sh -c "\"$@\" -DDFB_COMPILED -DDFB_COMPILING -o apart_compiled.so && \"$@\" -o apart_headers.so &&
+      \"$1\" -shared -Wl,--no-as-needed apart_compiled.so apart_headers.so -o apart.so" sh
+      ${CMAKE_CXX_COMPILER} -std=c++17 -I${_include} -shared -fPIC -include dfb/compiled.hpp
+      ${CMAKE_CURRENT_SOURCE_DIR}/guards/empty.cpp)
+  set_tests_properties(guard.compiled_apart PROPERTIES LABELS guard)
 endif()
 
 # Wrong use gives our message as the first error. The cases are in the files; a new case needs only a line
