@@ -23,9 +23,13 @@ tools() {
     have cmake || echo cmake
     have ninja || echo ninja-build
     have pkg-config || echo pkg-config
-    # Any MPI will do. Two of them side by side conflict.
-    if ! have mpiexec || ! have mpicxx; then
-        echo mpich libmpich-dev
+    # Any MPI will do. Two of them side by side conflict, so a part of Open MPI gets the rest of it.
+    if ! have mpiexec || ! echo '#include <mpi.h>' | mpicxx -E -x c++ - >/dev/null 2>&1; then
+        if mpiexec --version 2>&1 | grep -E 'Open MPI|OpenRTE|PRRTE' >/dev/null; then
+            echo openmpi-bin libopenmpi-dev
+        else
+            echo mpich libmpich-dev
+        fi
     fi
     if [ "$with" = clang ] && ! echo 'int main() {}' | clang++ -fsanitize=thread -x c++ - -o /dev/null 2>/dev/null; then
         echo clang libclang-rt-dev
