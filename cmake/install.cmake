@@ -32,7 +32,7 @@ write_basic_package_version_file(${PROJECT_BINARY_DIR}/dfbConfigVersion.cmake
   COMPATIBILITY SameMinorVersion ARCH_INDEPENDENT)
 install(FILES ${PROJECT_BINARY_DIR}/dfbConfig.cmake ${PROJECT_BINARY_DIR}/dfbConfigVersion.cmake
   DESTINATION ${_dfb_config_dir})
-install(FILES ${PROJECT_SOURCE_DIR}/LICENSE DESTINATION ${CMAKE_INSTALL_DOCDIR})
+install(FILES ${PROJECT_SOURCE_DIR}/LICENSE DESTINATION ${CMAKE_INSTALL_DATAROOTDIR}/doc/dfb)
 
 # For pkg-config: dfb-core.pc is for the headers alone, dfb.pc for all components. A dependency is named by the module
 # of pkg-config that has the headers which CMake has found, which keeps paths of this machine out. If there is no such
