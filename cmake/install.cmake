@@ -91,10 +91,20 @@ if(TARGET dfb_snappy)
   _dfb_pc_add(snappy Snappy::snappy $<TARGET_LINKER_FILE:Snappy::snappy> snappy)
 endif()
 
+# With a generator for several configurations, the files are for one of them: Release if there is one.
+set(_dfb_pc_condition "")
+if(CMAKE_CONFIGURATION_TYPES)
+  list(GET CMAKE_CONFIGURATION_TYPES 0 _dfb_pc_config)
+  if("Release" IN_LIST CMAKE_CONFIGURATION_TYPES)
+    set(_dfb_pc_config Release)
+  endif()
+  set(_dfb_pc_condition CONDITION $<CONFIG:${_dfb_pc_config}>)
+endif()
 # Relative to the .pc file, as an installed package may be moved.
 file(RELATIVE_PATH _dfb_pc_include ${CMAKE_INSTALL_FULL_DATADIR}/pkgconfig ${CMAKE_INSTALL_FULL_INCLUDEDIR})
 foreach(_dfb_name dfb dfb-core)
   configure_file(${CMAKE_CURRENT_LIST_DIR}/${_dfb_name}.pc.in ${PROJECT_BINARY_DIR}/${_dfb_name}.pc.in @ONLY)
-  file(GENERATE OUTPUT ${PROJECT_BINARY_DIR}/${_dfb_name}.pc INPUT ${PROJECT_BINARY_DIR}/${_dfb_name}.pc.in)
+  file(GENERATE OUTPUT ${PROJECT_BINARY_DIR}/${_dfb_name}.pc INPUT ${PROJECT_BINARY_DIR}/${_dfb_name}.pc.in
+    ${_dfb_pc_condition})
   install(FILES ${PROJECT_BINARY_DIR}/${_dfb_name}.pc DESTINATION ${CMAKE_INSTALL_DATADIR}/pkgconfig)
 endforeach()
