@@ -1,8 +1,7 @@
 # Runs of the program dfb_render, as its users start it: one ctest entry for each case of cli_cases.cmake.
 if(NOT TARGET dfb_render)
   if(DFB_BUILD_EXAMPLES)
-    add_test(NAME render COMMAND ${CMAKE_COMMAND} -E echo "skipped: there is no dfb_render: cmake says which packages it misses")
-    set_tests_properties(render PROPERTIES LABELS example SKIP_REGULAR_EXPRESSION "skipped: ")
+    dfb_skip_test(render example "there is no dfb_render: cmake says which packages it misses")
   endif()
   return()
 endif()
