@@ -1,5 +1,9 @@
 # Tests of the package: installs dfb, then builds and runs a user's project (CMakeLists.txt beside this file) against it
 # in every way that the README promises.
+if(NOT DFB_INSTALL)
+  dfb_skip_test(package.install package "there are no install rules (DFB_INSTALL)")
+  return()
+endif()
 set(_stage ${CMAKE_CURRENT_BINARY_DIR}/stage)
 set(_others ${DFB_COMPONENTS})
 list(REMOVE_ITEM _others core)
