@@ -1,37 +1,7 @@
 # cmake "-DROOTS=<folder that holds dfb/>;..." -P layers.cmake
-# Checks that the includes of the headers keep the layers of the library. A new header must be added to the table below.
+# Checks that no header includes itself through others, that folders keep their rules about each other, and that each
+# dependency is included in only one header.
 cmake_minimum_required(VERSION 3.21)
-
-# A header includes only headers of a strictly lower level.
-set(level_0 version.hpp)
-set(level_1 base/cpu.hpp base/detect.hpp base/fifo.hpp base/function_ref.hpp base/processors.hpp channels.hpp
-            comm/quiescence.hpp compiled.hpp frame/hidden_tiles.hpp fwd.hpp testing/reference.hpp trace.hpp)
-set(level_2 base/double_double.hpp blend/composite_row.hpp buffer.hpp comm/compression.hpp comm/heartbeat.hpp error.hpp
-            testing/error_report.hpp wire/wire_kernels.hpp)
-set(level_3 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/message.hpp
-            comm/mpi_calls.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp comm/transport.hpp exec.hpp
-            gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)
-set(level_4 blend/compositing.hpp comm/flow_control.hpp comm/mpi_ranks.hpp comm/mpi_session.hpp comm/progress.hpp
-            comm/reduction.hpp frame/open_frame.hpp image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp
-            trace_file.hpp)
-set(level_5 comm/connection.hpp testing/transport_conformance.hpp tile.hpp wire/active_pixels.hpp)
-set(level_6 blend/in_place_kernels.hpp comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp
-            dependency_tracker.hpp fragment.hpp tile_layout.hpp)
-set(level_7 blend/fragment_compositor.hpp frame.hpp testing/fault_transport.hpp tile_op.hpp
-            wire/sparse_planes.hpp wire/wire_losses.hpp)
-set(level_8 frame/declarations.hpp ops/sort_last.hpp pixel_op.hpp render/link_owners.hpp
-            render/sampling.hpp render/visibility.hpp wire/finished_record.hpp wire/fragment_message.hpp)
-set(level_9 frame/operations.hpp gather/final_gather.hpp ops/image_parallel.hpp ops/progressive.hpp render/cameras.hpp
-            testing/tile_op_test.hpp testing/verified.hpp)
-set(level_10 frame/accumulation.hpp frame/agreement.hpp frame/engine.hpp frame/tile_table.hpp
-            render/shared_world.hpp testing/adversarial.hpp)
-set(level_11 frame/tile_pipeline.hpp frame/verdict.hpp gather/wall.hpp)
-set(level_12 display_wall.hpp frame/outcome.hpp render/loops.hpp)
-set(level_13 frame/job_share.hpp render/deep_parallel.hpp render/mixed_parallel.hpp)
-set(level_14 frame/frame_engine.hpp)
-set(level_15 distributed_framebuffer.hpp image_compositor.hpp)
-set(level_16 dfb.hpp)
-set(last_level 16)
 
 # A dependency is included through a single header, its door.
 set(door_of_mpi comm/mpi_calls.hpp)
@@ -68,25 +38,8 @@ foreach(root IN LISTS ROOTS)
   endforeach()
 endforeach()
 
-foreach(level RANGE ${last_level})
-  foreach(header IN LISTS level_${level})
-    if(DEFINED "level_of_${header}")
-      message(SEND_ERROR "${header}: twice in the level table")
-    endif()
-    set("level_of_${header}" ${level})
-    if(NOT DEFINED "root_of_${header}")
-      message(SEND_ERROR "${header}: in the level table, but there is no such header")
-    endif()
-  endforeach()
-endforeach()
-
 foreach(header IN LISTS headers)
   set("includes_of_${header}" "")
-  if(NOT DEFINED "level_of_${header}")
-    message(SEND_ERROR "${header}: not in the level table of tests/guards/layers.cmake")
-    continue()
-  endif()
-
   file(STRINGS ${root_of_${header}}/dfb/${header} lines REGEX "^[ \t]*#[ \t]*include")
   foreach(line IN LISTS lines)
     if(NOT line MATCHES "include[ \t]*<([^>]*)>")
@@ -110,12 +63,6 @@ foreach(header IN LISTS headers)
     if(target MATCHES "^dfb/(.*)")
       set(target ${CMAKE_MATCH_1})
       list(APPEND "includes_of_${header}" ${target})
-      if(NOT DEFINED "level_of_${target}")
-        message(SEND_ERROR "${header}: includes ${target}, which is not in the level table")
-      elseif(NOT "${level_of_${target}}" LESS "${level_of_${header}}")
-        message(SEND_ERROR "${header} (level ${level_of_${header}}) includes ${target} (level ${level_of_${target}}): "
-          "includes point down")
-      endif()
     endif()
   endforeach()
 
@@ -151,6 +98,16 @@ function(collect header)
   endforeach()
   set(reached ${reached} PARENT_SCOPE)
 endfunction()
+
+foreach(header IN LISTS headers)
+  foreach(target IN LISTS "includes_of_${header}")
+    set(reached ${target})
+    collect(${target})
+    if(header IN_LIST reached)
+      message(SEND_ERROR "${header} includes ${target}, which includes ${header} again, maybe through others")
+    endif()
+  endforeach()
+endforeach()
 
 function(check_blind who whom)
   foreach(header IN LISTS headers)
