@@ -51,7 +51,7 @@ sh "$root/cmake/install_packages.sh"
 say "building dfb_render in $build"
 (
     cd "$root"
-    cmake --preset release
+    cmake --preset release -DDFB_WITH_MPI=ON -DDFB_BUILD_EXAMPLES=ON
     cmake --build --preset release --parallel "$jobs" --target dfb_render
 )
 

@@ -28,7 +28,8 @@ build() {
 
 # differential: runs the test, with its output in $copy/test.log
 differential() {
-    timeout 300 mpiexec -n 3 "$copy/build/tests/icet/test_icet_differential" "$icet" \
+    # shellcheck disable=SC2086 # one word per flag
+    timeout 300 "$mpiexec" $flags -n 3 "$copy/build/tests/icet/test_icet_differential" "$icet" \
         "$copy/build/examples/adapters/icet/libdfb_icet.so" --cases "$cases" </dev/null >"$copy/test.log" 2>&1
 }
 
@@ -52,6 +53,13 @@ if [ ! "$isCheck" ]; then
     (cd "$source" && tar -cf - --exclude=./build --exclude=./.git .) | tar -xf - -C "$copy"
     cmake -S "$copy" -B "$copy/build" -G Ninja -DCMAKE_BUILD_TYPE=Debug -DCMAKE_CXX_FLAGS_DEBUG="-O1" \
         -DDFB_BUILD_BENCH=OFF -DDFB_ICET_DIR="$source/build/peers/icet" >"$copy/cmake.log"
+    # The launcher of the MPI with which the test is built.
+    mpiexec=$(sed -n 's/^MPIEXEC_EXECUTABLE:[A-Z]*=//p' "$copy/build/CMakeCache.txt")
+    flags=
+    if "$mpiexec" --version 2>&1 | grep -E 'Open MPI|OpenRTE|PRRTE' >/dev/null; then
+        flags="--oversubscribe --bind-to none"
+        [ "$(id -u)" -ne 0 ] || flags="$flags --allow-run-as-root"
+    fi
     build
     if ! differential; then
         echo "faults.sh: FAILED: the test fails without a fault: see $copy/test.log" >&2

@@ -18,11 +18,19 @@ output=${1:-$root/build/live_browser}
 if [ -z "${DFB_RENDER:-}" ]; then
     (
         cd "$root"
-        cmake --preset release
+        cmake --preset release -DDFB_WITH_MPI=ON -DDFB_BUILD_EXAMPLES=ON
         cmake --build --preset release --target dfb_render in_situ
     )
     DFB_RENDER=$root/build/release/examples/embree/dfb_render
     DFB_IN_SITU=$root/build/release/examples/in_situ
+    # The launcher of the MPI with which these are built.
+    mpiexec=$(sed -n 's/^MPIEXEC_EXECUTABLE:[A-Z]*=//p' "$root/build/release/CMakeCache.txt")
+    flags=
+    if "$mpiexec" --version 2>&1 | grep -E 'Open MPI|OpenRTE|PRRTE' >/dev/null; then
+        flags=";--oversubscribe;--bind-to;none"
+        [ "$(id -u)" -ne 0 ] || flags="$flags;--allow-run-as-root"
+    fi
+    DFB_MPIEXEC="$mpiexec$flags;-n"
 fi
 mkdir -p "$output"
 DFB_RENDER=$DFB_RENDER DFB_IN_SITU=$DFB_IN_SITU DFB_MPIEXEC=${DFB_MPIEXEC:-mpiexec;-n} DFB_LIVE_NODE_MODULES=$modules \
