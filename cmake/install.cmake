@@ -18,6 +18,12 @@ foreach(_dfb_component IN LISTS DFB_COMPONENTS)
     DESTINATION ${_dfb_config_dir})
 endforeach()
 
+# For a project that has dfb's sources in it and exports a library which links dfb::dfb. The file is not installed, as
+# dfbConfig.cmake makes dfb::dfb.
+install(TARGETS dfb EXPORT dfb-dfb)
+install(EXPORT dfb-dfb NAMESPACE dfb:: FILE dfb-dfb.cmake DESTINATION ${_dfb_config_dir}
+  COMPONENT dfb-dfb EXCLUDE_FROM_ALL)
+
 # Installed only by cmake --install <build> --component testing.
 target_include_directories(dfb_testing INTERFACE $<INSTALL_INTERFACE:${CMAKE_INSTALL_INCLUDEDIR}/dfb-testing>)
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/tests/include/dfb DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/dfb-testing
