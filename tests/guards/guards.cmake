@@ -141,8 +141,8 @@ target_compile_options(test_odr PRIVATE -Wconversion)
 add_test(NAME guard.odr COMMAND test_odr)
 set_tests_properties(guard.odr PROPERTIES LABELS guard)
 
-# The linker refuses a program of which some files link dfb::compiled and others use the headers alone. It accepts shared
-# libraries that differ in this.
+# The linker refuses a program of which some files link dfb::compiled and others use the headers alone. It accepts
+# shared libraries that differ in this.
 if(NOT DFB_DEVELOP_HEADER_ONLY AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
   add_test(NAME guard.compiled_mixed COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -I${_include}
     ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/headers.cpp ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/compiled.cpp

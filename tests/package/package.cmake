@@ -79,7 +79,8 @@ endforeach()
 set_tests_properties(package.add_subdirectory PROPERTIES FIXTURES_REQUIRED dfb_stage)
 # Folders of one project ask for different components.
 list(JOIN _others "," _folders)
-dfb_add_package_test(find_package_folders HOW find_package COMPONENTS core EXPECT ${_others} OPTIONS -DFOLDERS=${_folders})
+dfb_add_package_test(find_package_folders HOW find_package COMPONENTS core EXPECT ${_others}
+  OPTIONS -DFOLDERS=${_folders})
 
 # Core alone, and each component alone, on a machine that has no other dependency. The frame with core is tested below,
 # with the compiled library; header.dfb compiles it as headers.
