@@ -16,6 +16,8 @@
 #include <limits>
 #include <memory>
 #include <mutex>
+#include <optional>
+#include <sstream>
 #include <string>
 #include <thread>
 #include <vector>
@@ -69,18 +71,49 @@ int fromLauncher(const char* mpich, const char* openMpi, int otherwise)
     return otherwise;
 }
 
+// Returns "" if this rank has the options of rank 0, otherwise what differs. Ranks may differ in --threads. Collective.
+std::string differenceOf(const Options& options, int rank)
+{
+    std::string own;
+    for (const std::string& word : options.scene)
+        own += word + '\n';
+    for (const auto& [name, value] : options.values)
+        if (name != "threads")
+            own += "--" + name + ' ' + value + '\n';
+    std::string first = own;
+    int size = static_cast<int>(own.size());
+    MPI_Bcast(&size, 1, MPI_INT, 0, MPI_COMM_WORLD);
+    first.resize(static_cast<std::size_t>(size));
+    MPI_Bcast(first.data(), size, MPI_CHAR, 0, MPI_COMM_WORLD);
+    std::istringstream linesOfFirst(first), linesOfOwn(own);
+    for (std::string theirs, mine; std::getline(linesOfOwn, mine);)
+        if (!std::getline(linesOfFirst, theirs) || mine != theirs)
+            return "all ranks need the same options, but rank " + std::to_string(rank) + " has '" + mine
+                   + "' where rank 0 has '" + theirs + "'";
+    return own == first ? "" : "all ranks need the same options, but rank 0 has more than rank " + std::to_string(rank);
+}
+
 int runWithMpi(int argc, char** argv, const ParsedOptions& parsed)
 {
     const dfb::MpiSession mpi(argc, argv);
     const int rank = mpi.rank();
+    // If ranks are wrong, the lowest of them says why, and all leave.
+    const auto isWrongOnAny = [&](bool isWrong, const ParsedOptions& why) {
+        int lowest = isWrong ? rank : mpi.size();
+        MPI_Allreduce(MPI_IN_PLACE, &lowest, 1, MPI_INT, MPI_MIN, MPI_COMM_WORLD);
+        if (lowest == rank)
+            report(why);
+        return lowest < mpi.size();
+    };
+    if (isWrongOnAny(!parsed.options, parsed))
+        return parsed.options ? exitUsage : parsed.exitCode;
+    const std::string difference = differenceOf(*parsed.options, rank);
+    if (isWrongOnAny(!difference.empty(), {std::nullopt, exitUsage, "dfb_render: " + difference}))
+        return exitUsage;
     int code = exitFailed;
     try {
-        if (!parsed.options) {
-            code = rank == 0 ? report(parsed) : parsed.exitCode;
-        } else {
-            const WorkerLimit limit(parsed.options->threads);
-            code = runMpi(MPI_COMM_WORLD, *parsed.options, parsed.options->threads);
-        }
+        const WorkerLimit limit(parsed.options->threads);
+        code = runMpi(MPI_COMM_WORLD, *parsed.options, parsed.options->threads);
     } catch (const dfb::InvalidArgument& e) { // this and the next are the same on all ranks
         if (rank == 0)
             std::fprintf(stderr, "dfb_render: %s\n", e.what());
