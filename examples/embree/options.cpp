@@ -346,6 +346,8 @@ private:
         refuse(options_.mode != Mode::Image, "--path", "needs --mode image: paths go through the whole scene");
         refuse(!isData, "--interleave", "needs --mode data");
         refuse(!isData, "--deep", "needs --mode data");
+        refuse(options_.bricks > mostCells / options_.interleave, "--interleave",
+               "makes more than 16777216 cells of so many --bricks");
         refuse(options_.interleave > 1 || options_.deep > 0, "--adaptive", "does not go with --interleave or --deep");
         refuse(options_.interleave > 1 || options_.deep > 0, "--aux", "does not go with --interleave or --deep");
         refuse(options_.interleave > 1 || options_.deep > 0, "--wall", "does not go with --interleave or --deep");

@@ -41,6 +41,8 @@ struct OutputFiles {
     }
 };
 
+inline constexpr int mostCells = 1 << 24; // of all bricks
+
 struct Options : OutputFiles, RenderSettings {
     std::vector<std::string> scene; // `synthetic`, `demo`, or files, as the user wrote them
     std::vector<SceneFile> files;   // the files among these, each with its look

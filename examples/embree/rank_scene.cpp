@@ -9,6 +9,7 @@
 
 #include <algorithm>
 #include <iterator>
+#include <stdexcept>
 #include <string>
 #include <utility>
 
@@ -71,6 +72,9 @@ RankScene loadRankScene(const Options& options, const Loaders& loaders)
     const int rank = loaders.rank(), rankCount = loaders.size();
     const bool isImage = options.mode == Mode::Image;
     const int sceneBricks = options.bricks > 0 ? options.bricks : rankCount, brickCount = isImage ? 1 : sceneBricks;
+    if (brickCount > mostCells / options.interleave)
+        throw std::runtime_error("--interleave " + std::to_string(options.interleave) + " makes more than "
+                                 + std::to_string(mostCells) + " cells of " + std::to_string(brickCount) + " bricks");
     Scene scene = makeScene(options, sceneBricks, loaders);
     RenderSettings settings = options;
     RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes, {}};

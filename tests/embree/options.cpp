@@ -190,6 +190,8 @@ TEST_CASE("What is wrong on the command line is refused in one line that names i
     checkRefused({"--camera-distance", "-1"});
     for (const std::string value : {"0", "-1", "1.5", "last"})
         checkRefused({"--xyz-frame", value});
+    checkRefused({"--interleave", "4096", "--bricks", "1048576"}); // more cells than an int can count
+    checkRefused({"--interleave", "17", "--bricks", "1048576"});
     checkRefused({"--opacity", "1.01"});
     checkRefused({"--opacity", "-0.01"});
     checkRefused({"--background", "1,1"});
