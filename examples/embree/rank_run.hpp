@@ -22,6 +22,7 @@
 #include <cstdint>
 #include <cstdio>
 #include <exception>
+#include <limits>
 #include <memory>
 #include <optional>
 #include <stdexcept>
@@ -115,7 +116,8 @@ private:
             progress.tileDone();
         };
         params_.passes = o_.passes;
-        params_.maxLayers = static_cast<int>(work_.scene->bounds.size()) * std::max(1, o_.deep);
+        const std::int64_t layers = static_cast<std::int64_t>(work_.scene->bounds.size()) * std::max(1, o_.deep);
+        params_.maxLayers = static_cast<int>(std::min<std::int64_t>(layers, std::numeric_limits<int>::max()));
         if (o_.background)
             params_.background = {(*o_.background)[0], (*o_.background)[1], (*o_.background)[2], 1.0f};
     }
