@@ -19,6 +19,16 @@ public:
     // Throws CLI::ConfigError.
     std::vector<CLI::ConfigItem> from_config(std::istream& stream) const override
     {
+        std::vector<CLI::ConfigItem> all = itemsOf(stream);
+        for (const CLI::ConfigItem& item : all)
+            if (item.inputs.empty() && item.name != "++" && item.name != "--") // these begin and end a section
+                throw CLI::ConfigError("--config: " + item.name + ": the list is empty");
+        return all;
+    }
+
+private:
+    std::vector<CLI::ConfigItem> itemsOf(std::istream& stream) const
+    {
         const std::string text{std::istreambuf_iterator<char>(stream), {}};
         const std::size_t first = text.find_first_not_of(" \t\r\n");
         if (first == std::string::npos || text[first] != '{') {

@@ -317,10 +317,13 @@ private:
                 detail::parseThree("--origin", origin_, -1e12, 1e12, "X,Y,Z with three numbers of at most 1e12");
     }
 
-    // Throws CLI::ValidationError if the option was given although that is wrong.
+    static bool isFlag(const CLI::Option& option) { return option.get_expected_max() == 0; }
+
+    // Throws CLI::ValidationError if the option was given although that is wrong. A flag that is false counts as not
+    // given.
     void refuse(bool wrong, const char* option, const char* why) const
     {
-        if (wrong && app_.count(option) > 0)
+        if (wrong && app_.count(option) > 0 && (!isFlag(*app_[option]) || app_[option]->as<bool>()))
             throw CLI::ValidationError(option, why);
     }
 
@@ -439,8 +442,8 @@ private:
                 || option->get_name() == "--save-options" || (areGiven && option->count() == 0))
                 continue;
             std::string text = option->count() > 0 ? option->results().back() : option->get_default_str();
-            if (option->get_expected_max() == 0) // a flag
-                text = option->count() > 0 ? "true" : "false";
+            if (isFlag(*option))
+                text = option->count() > 0 && option->as<bool>() ? "true" : "false";
             if (const auto words = wordsOf_.find(option); words != wordsOf_.end())
                 text = words->second.at(static_cast<std::size_t>(std::atoi(text.c_str())));
             if (!text.empty())

@@ -4,6 +4,7 @@
 #include <frame_pattern.hpp>
 #include <options.hpp>
 
+#include <algorithm>
 #include <array>
 #include <map>
 #include <string>
@@ -373,6 +374,12 @@ TEST_CASE("The options are there as they count, for the record", "[options]")
     CHECK(values.count("alpha") == 0); // no such file
     CHECK(values.count("help") == 0);
     CHECK(values.count("scene") == 0);
+    const auto has = [](const Options& options, const char* name, const char* text) {
+        return std::count(options.values.begin(), options.values.end(),
+                          std::pair<std::string, std::string>(name, text));
+    };
+    CHECK(has(options({"demo", "--shadows=false"}), "shadows", "false") == 1);
+    CHECK(has(options({"demo", "--shadows=true"}), "shadows", "true") == 1);
 }
 
 TEST_CASE("Surfaces from files have ambient occlusion, unless the user says otherwise", "[options]")

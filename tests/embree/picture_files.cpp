@@ -217,6 +217,19 @@ TEST_CASE("The options of a run are read again as they were", "[options][config]
     CHECK(read.options->passes == 4);
     CHECK(read.options->shadows);
     CHECK(read.options->width == 30);
+    // A flag that is false is as if it were not given.
+    const ParsedOptions off =
+        parse({"demo", "--config", folder.write("off", "{\"shadows\": false, \"dither\": false}")});
+    INFO(off.message);
+    REQUIRE(off.options);
+    CHECK_FALSE(off.options->shadows);
+    CHECK(test::contains(optionsText(off.options->scene, off.options->given), "\"shadows\": false"));
+    for (const char* empty : {"{\"spp\": []}", "spp = []\n"}) {
+        const ParsedOptions parsed = parse({"demo", "--config", folder.write("empty", empty)});
+        INFO(parsed.message);
+        CHECK(parsed.exitCode == 2);
+        CHECK(test::contains(parsed.message, "--config: spp: the list is empty"));
+    }
     const ParsedOptions named = parse({"c.ply", "--config", toml});
     REQUIRE(named.options);
     CHECK(named.options->scene == std::vector<std::string>{"c.ply"});
