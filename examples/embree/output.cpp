@@ -47,11 +47,10 @@ void writeFloats(const std::string& path, int width, int height, const float* va
         detail::failToWrite(path, std::strerror(errno));
 }
 
-// Writes rows of 16-bit sRGB; `fillRow(y)` puts each into `row`. Returns false if libpng fails. It reports that by
-// longjmp, so nothing here may have a destructor.
-template <class FillRow>
-bool writePngRows(std::FILE* file, int width, int height, bool hasAlpha, const std::uint8_t* row,
-                  const FillRow& fillRow)
+// Writes a PNG in sRGB of rows that `rowOf(y)` returns, RGBA with this many bits each, 8 or 16 (big-endian). Returns
+// false if libpng fails. It reports that by longjmp, so nothing here may have a destructor.
+template <class RowOf>
+bool writePngRows(std::FILE* file, int width, int height, int bits, bool hasAlpha, const RowOf& rowOf)
 {
     png_structp png = png_create_write_struct(
         PNG_LIBPNG_VER_STRING, nullptr, [](png_structp p, png_const_charp) { png_longjmp(p, 1); },
@@ -62,18 +61,31 @@ bool writePngRows(std::FILE* file, int width, int height, bool hasAlpha, const s
         return false;
     }
     png_init_io(png, file);
-    png_set_IHDR(png, info, static_cast<png_uint_32>(width), static_cast<png_uint_32>(height), 16,
+    png_set_IHDR(png, info, static_cast<png_uint_32>(width), static_cast<png_uint_32>(height), bits,
                  hasAlpha ? PNG_COLOR_TYPE_RGB_ALPHA : PNG_COLOR_TYPE_RGB, PNG_INTERLACE_NONE,
                  PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
     png_set_sRGB(png, info, PNG_sRGB_INTENT_PERCEPTUAL);
     png_write_info(png, info);
-    for (int y = 0; y < height; ++y) {
-        fillRow(y);
-        png_write_row(png, row);
-    }
+    if (!hasAlpha)
+        png_set_filler(png, 0, PNG_FILLER_AFTER); // leaves alpha out
+    for (int y = 0; y < height; ++y)
+        png_write_row(png, rowOf(static_cast<std::size_t>(y)));
     png_write_end(png, info);
     png_destroy_write_struct(&png, &info);
     return true;
+}
+
+template <class RowOf>
+void writePngFile(const std::string& path, int width, int height, int bits, bool hasAlpha, const RowOf& rowOf)
+{
+    errno = 0;
+    std::FILE* file = std::fopen(path.c_str(), "wb");
+    if (file == nullptr)
+        detail::failToWrite(path, std::strerror(errno));
+    const bool written = writePngRows(file, width, height, bits, hasAlpha, rowOf);
+    const bool closed = std::fclose(file) == 0;
+    if (!written || !closed)
+        detail::failToWrite(path, errno != 0 ? std::strerror(errno) : "libpng cannot");
 }
 
 // The `value` of each rank.
@@ -165,60 +177,31 @@ void requireWritable(const std::string& path)
 
 void writePng(const std::string& path, int width, int height, const std::uint8_t* srgba, bool hasAlpha)
 {
-    const std::size_t pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
-    std::vector<std::uint8_t> rgb;
-    if (!hasAlpha) {
-        rgb.resize(3 * pixels);
-        for (std::size_t i = 0; i < pixels; ++i)
-            std::memcpy(rgb.data() + 3 * i, srgba + 4 * i, 3);
-    }
-    png_image image{};
-    image.version = PNG_IMAGE_VERSION;
-    image.width = static_cast<png_uint_32>(width);
-    image.height = static_cast<png_uint_32>(height);
-    image.format = hasAlpha ? PNG_FORMAT_RGBA : PNG_FORMAT_RGB;
-    // Not png_image_write_to_file, which deletes the file, or even a device, when it fails.
-    errno = 0;
-    std::FILE* file = std::fopen(path.c_str(), "wb");
-    if (file == nullptr)
-        detail::failToWrite(path, std::strerror(errno));
-    const void* first = hasAlpha ? static_cast<const void*>(srgba) : rgb.data();
-    const bool written = png_image_write_to_stdio(&image, file, 0, first, 0, nullptr) != 0;
-    const bool closed = std::fclose(file) == 0;
-    if (!written || !closed)
-        detail::failToWrite(path, written ? std::strerror(errno) : image.message);
+    writePngFile(path, width, height, 8, hasAlpha,
+                 [&](std::size_t y) { return srgba + 4 * y * static_cast<std::size_t>(width); });
 }
 
 void writePng16(const std::string& path, int width, int height, const float* rgba, bool hasAlpha)
 {
-    const std::size_t channels = hasAlpha ? 4 : 3;
-    std::vector<std::uint8_t> row(2 * channels * static_cast<std::size_t>(width));
+    const std::size_t rowSize = 4 * static_cast<std::size_t>(width);
+    std::vector<std::uint8_t> row(2 * rowSize);
     const auto encoded = [](double linear) {
         const double v = linear > 0 ? std::min(linear, 1.0) : 0.0; // also of NaN
         return v <= 0.0031308 ? 12.92 * v : 1.055 * std::pow(v, 1 / 2.4) - 0.055;
     };
-    const auto fill = [&](const float* pixels) {
+    writePngFile(path, width, height, 16, hasAlpha, [&](std::size_t y) {
         std::size_t at = 0;
-        for (int x = 0; x < width; ++x, pixels += 4) {
-            const double alpha = !hasAlpha ? 1.0 : pixels[3] > 0 ? std::min(static_cast<double>(pixels[3]), 1.0) : 0.0;
-            for (std::size_t c = 0; c < channels; ++c) {
-                const double v = c == 3 ? alpha : alpha > 0 ? encoded(static_cast<double>(pixels[c]) / alpha) : 0.0;
+        for (const float *pixel = rgba + y * rowSize, *end = pixel + rowSize; pixel != end; pixel += 4) {
+            const double alpha = !hasAlpha ? 1.0 : pixel[3] > 0 ? std::min(static_cast<double>(pixel[3]), 1.0) : 0.0;
+            for (std::size_t c = 0; c < 4; ++c) {
+                const double v = c == 3 ? alpha : alpha > 0 ? encoded(static_cast<double>(pixel[c]) / alpha) : 0.0;
                 const unsigned level = static_cast<unsigned>(v * 65535 + 0.5);
-                row[at++] = static_cast<std::uint8_t>(level >> 8); // big-endian
+                row[at++] = static_cast<std::uint8_t>(level >> 8);
                 row[at++] = static_cast<std::uint8_t>(level & 255);
             }
         }
-    };
-    errno = 0;
-    std::FILE* file = std::fopen(path.c_str(), "wb");
-    if (file == nullptr)
-        detail::failToWrite(path, std::strerror(errno));
-    const bool written = writePngRows(file, width, height, hasAlpha, row.data(), [&](int y) {
-        fill(rgba + 4 * static_cast<std::size_t>(y) * static_cast<std::size_t>(width));
+        return row.data();
     });
-    const bool closed = std::fclose(file) == 0;
-    if (!written || !closed)
-        detail::failToWrite(path, errno != 0 ? std::strerror(errno) : "libpng cannot");
 }
 
 std::vector<std::uint8_t> straightPixels(int width, int height, const float* rgba, bool dither)

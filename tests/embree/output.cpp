@@ -328,6 +328,7 @@ TEST_CASE("What cannot be written is an error that names the file", "[output]")
         CHECK(isLineWith(errorOf([&] { writePfm(path, 64, 64, rgba.data()); }), why));
         CHECK(isLineWith(errorOf([&] { writeGreyPfm(path, 64, 64, rgba.data(), 4); }), why));
         CHECK(isLineWith(errorOf([&] { writePng(path, 64, 64, srgba.data(), true); }), why));
+        CHECK(isLineWith(errorOf([&] { writePng16(path, 64, 64, rgba.data(), false); }), why));
         CHECK(isLineWith(errorOf([&] { writeStats(path, someStats()); }), why));
         if (path != full)
             CHECK(isLineWith(errorOf([&] { requireWritable(path); }), why));
