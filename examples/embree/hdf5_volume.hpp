@@ -20,7 +20,7 @@ namespace example {
 
 namespace detail {
 
-// HDF5 as Debian builds it is not thread-safe, and ranks may be threads.
+// Ranks may be threads, and not every build of HDF5 is thread-safe.
 inline std::mutex& hdf5Mutex()
 {
     static std::mutex mutex;
@@ -144,6 +144,7 @@ private:
         space_ = Hdf5Object();
         data_ = Hdf5Object();
         file_ = Hdf5Object();
+        H5Eclear2(H5E_DEFAULT); // otherwise the library may print the errors of this thread when the program ends
     }
 
     // The names of the first data sets in the file, as a text.
