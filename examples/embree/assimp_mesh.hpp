@@ -11,7 +11,6 @@
 #endif
 
 #include <algorithm>
-#include <cmath>
 #include <cstdint>
 #include <stdexcept>
 #include <string>
@@ -29,12 +28,13 @@ inline bool isAssimpEnding(const std::string& ending)
 
 namespace detail {
 
-inline void requireFinite(const aiMesh& part, const std::string& name)
+inline void requireUsable(const aiMesh& part, const std::string& name)
 {
     for (unsigned i = 0; i < part.mNumVertices; ++i) {
         const aiVector3D& p = part.mVertices[i];
-        if (!(std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z)))
-            throw std::runtime_error(name + ": vertex " + std::to_string(i) + " is not finite");
+        if (!isUsable({p.x, p.y, p.z}))
+            throw std::runtime_error(name + ": vertex " + std::to_string(i)
+                                     + ": expected finite coordinates below 1e15");
     }
 }
 
@@ -56,10 +56,8 @@ inline void addNode(Mesh& mesh, const aiScene& scene, const aiNode& node, const 
             const aiVector3D p = place * part.mVertices[i];
             const aiColor4D own = part.HasVertexColors(0) ? part.mColors[0][i] : aiColor4D(1, 1, 1, 1);
             const auto channel = [](float v) { return v > 0 ? std::min(v, 1.0f) : 0.0f; };
-            mesh.positions.push_back({p.x, p.y, p.z});
+            addVertex(mesh, {p.x, p.y, p.z}, [&name] { return name + ": where a node moves a vertex"; });
             mesh.colors.push_back({channel(own.r * base.r), channel(own.g * base.g), channel(own.b * base.b)});
-            if (!(std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z)))
-                throw std::runtime_error(name + ": a node moves a vertex to where no number is");
         }
         std::vector<std::int64_t> polygon;
         for (unsigned f = 0; f < part.mNumFaces; ++f) {
@@ -89,7 +87,7 @@ inline Mesh parseWithAssimp(std::string_view bytes, const std::string& name, Not
                                : importer.ReadFileFromMemory(bytes.data(), bytes.size(), 0, ending.c_str() + 1);
     // Before vertices are joined: one that is no number counts as equal to others there.
     for (unsigned m = 0; scene && m < scene->mNumMeshes; ++m)
-        detail::requireFinite(*scene->mMeshes[m], name);
+        detail::requireUsable(*scene->mMeshes[m], name);
     if (scene && scene->mRootNode)
         scene = importer.ApplyPostProcessing(aiProcess_Triangulate | aiProcess_JoinIdenticalVertices
                                              | aiProcess_SortByPType);

@@ -146,16 +146,21 @@ TEST_CASE("A wrong file of another kind is one line", "[assimp]")
     const float nan = std::numeric_limits<float>::quiet_NaN();
     std::string withNan = stl;
     std::memcpy(withNan.data() + 84 + 12, &nan, sizeof nan);
+    std::string tooFar = stl;
+    const float far = 1e15f;
+    std::memcpy(tooFar.data() + 84 + 12, &far, sizeof far);
     const std::pair<std::string, std::string> wrong[] = {
         {"short.stl", stl.substr(0, stl.size() - 30)},
         {"more.stl", binaryStl(1000000)},
         {"nan.stl", withNan},
+        {"far.stl", tooFar},
         {"none.stl", "solid nothing\nendsolid nothing\n"},
         {"text.stl", "no triangles at all"},
         {"short.glb", good.substr(0, good.size() - 30)},
         {"head.glb", good.substr(0, 20)},
         {"index.glb", glb(gltfJson(""), gltfBuffer(7))},
         {"nan.glb", glb(gltfJson(""), gltfBuffer(2, nan))},
+        {"far.glb", glb(gltfJson(""), gltfBuffer(2, 0.6e15f))}, // its node doubles it
         {"json.gltf", gltfJson("\"uri\":\"pixels.bin\",").substr(0, 200)},
         {"missing.gltf", gltfJson("\"uri\":\"nowhere.bin\",")},
         {"empty.gltf", "{\"asset\":{\"version\":\"2.0\"}}"},
