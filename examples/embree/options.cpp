@@ -399,6 +399,7 @@ private:
                                                          + std::to_string(options_.bezel));
         }
         outputs_->checkPatterns(options_);
+        OutputOptions::refuseEqualNames(options_);
     }
 
     void readScene()

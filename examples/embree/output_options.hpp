@@ -7,9 +7,12 @@
 
 #include <CLI/CLI.hpp>
 
+#include <filesystem>
+#include <map>
 #include <stdexcept>
 #include <string>
 #include <utility>
+#include <vector>
 
 namespace example {
 
@@ -74,6 +77,22 @@ public:
             throw CLI::ValidationError("--png-bits", "needs --output FILE.png");
         if (app_.count("--layers") > 0)
             files.layers = detail::parseLayers("--layers", layers_);
+    }
+
+    // Throws CLI::ValidationError if two of the files have one name.
+    static void refuseEqualNames(const OutputFiles& files)
+    {
+        std::vector<std::pair<const char*, std::string>> all{
+            {"--output", files.output}, {"--alpha", files.alpha}, {"--depth", files.depth},
+            {"--stats", files.stats},   {"--trace", files.trace}, {"--save-options", files.saveOptions}};
+        for (const char* ending : {".normal.pfm", ".albedo.pfm", ".position.pfm", ".primitive.png", ".instance.png"})
+            all.emplace_back("--aux", files.aux.empty() ? "" : files.aux + ending);
+        std::map<std::filesystem::path, const char*> options;
+        for (const auto& [option, name] : all)
+            if (!name.empty())
+                if (const auto [other, isNew] = options.emplace(std::filesystem::path(name).lexically_normal(), option);
+                    !isNew)
+                    throw CLI::ValidationError(option, "'" + name + "' is also written by " + other->second);
     }
 
     // Throws CLI::ValidationError if a name is no pattern, or must not be one.

@@ -275,6 +275,18 @@ TEST_CASE("The camera's place and the look arrive", "[options]")
     }
 }
 
+TEST_CASE("Two files with one name are refused", "[options]")
+{
+    checkRefused({"--depth", "a.pfm", "--alpha", "a.pfm"});
+    checkRefused({"--alpha", "./a.pfm", "--output", "a.pfm"});
+    checkRefused({"--alpha", "a.normal.pfm", "--aux", "a"});
+    checkRefused({"--output", "a.instance.png", "--aux", "a"});
+    checkRefused({"--trace", "a.json", "--stats", "a.json"});
+    checkRefused({"--save-options", "a.json", "--stats", "a.json"});
+    checkRefused({"--save-options", "a.json", "--trace", "b/../a.json"});
+    CHECK(parse({"demo", "--output", "a.pfm", "--alpha", "b.pfm", "--depth", "b/a.pfm", "--aux", "a"}).options);
+}
+
 TEST_CASE("Of an option that is given twice the last counts", "[options]")
 {
     const Options o =
