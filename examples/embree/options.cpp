@@ -152,7 +152,7 @@ private:
              "Distances between the voxels of volumes along their three axes, as in 1,1,2 for slices that are twice as "
              "thick as their pixels are wide; default: as the header says, or 1,1,1");
         text("--origin", origin_, "X,Y,Z",
-             "Where the first voxel of volumes is, with --no-fit; default: as the header says, or 0,0,0");
+             "Where the first voxel of volumes is, with --no-fit or for --clip; default: as the header says, or 0,0,0");
     }
 
     void addDistribution()
@@ -335,6 +335,9 @@ private:
             refuse(options_.live.has_value(), other, "does not go with --live");
         refuse(options_.live && options_.blend != Blending::Sort, "--blend",
                "order or nearest does not go with --live");
+        refuse(options_.live && options_.balance == Balance::Cost, "--balance", "cost does not go with --live");
+        refuse(options_.live && options_.distribution != Distribution::Owned, "--distribution",
+               "other than owned does not go with --live");
         const bool isData = options_.mode == Mode::Data;
         refuse(options_.mode == Mode::Image, "--blend", "does not go with --mode image");
         for (const char* other : {"--adaptive", "--interleave", "--deep", "--wall", "--exposure"})
@@ -345,6 +348,8 @@ private:
                "--camera", "does not go with --blend order: one order is not right for all its rays");
         refuse(options_.mode != Mode::Mixed, "--replicate", "needs --mode mixed");
         refuse(options_.mode != Mode::Mixed, "--balance", "needs --mode mixed");
+        refuse(options_.blend == Blending::Order && options_.balance == Balance::Cost, "--balance",
+               "cost does not go with --blend order");
         refuse(options_.mode != Mode::Image, "--distribution", "needs --mode image");
         refuse(options_.mode != Mode::Image, "--path", "needs --mode image: paths go through the whole scene");
         refuse(!isData, "--interleave", "needs --mode data");
@@ -410,8 +415,8 @@ private:
             const bool generated = word == "synthetic" || word == "demo";
             if (generated && options_.scene.size() > 1)
                 throw CLI::ValidationError("scene", "'" + word + "' stands alone, not beside other scenes");
-            if (generated && options_.look.clip)
-                throw CLI::ValidationError("--clip", "is for files, not for '" + word + "'");
+            for (const char* other : {"--clip", "--spacing", "--origin", "--xyz-frame", "--no-fit"})
+                refuse(generated, other, ("is for files, not for '" + word + "'").c_str());
             if (generated)
                 continue;
             SceneFile file;
@@ -432,6 +437,9 @@ private:
             if (app_.count("--ao") == 0 && !isVolume && options_.pathBounces == 0)
                 options_.aoRays = options_.live ? 4 : 16; // samples accumulate in a live view
         }
+        const bool clips = std::any_of(options_.files.begin(), options_.files.end(),
+                                       [](const SceneFile& file) { return file.look.clip.has_value(); });
+        refuse(options_.fit && !clips, "--origin", "needs --no-fit or --clip: otherwise each file is centred");
     }
 
     // The names and effective values of all options, or of those that were given. Options without a value are left out.

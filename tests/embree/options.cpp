@@ -275,6 +275,25 @@ TEST_CASE("The camera's place and the look arrive", "[options]")
     }
 }
 
+TEST_CASE("What would do nothing is refused", "[options]")
+{
+    checkRefused({"--balance", "cost", "--mode", "mixed", "--blend", "order"});
+    checkRefused({"--balance", "cost", "--mode", "mixed", "--live"});
+    checkRefused({"--distribution", "dynamic", "--mode", "image", "--live"});
+    CHECK(parse({"demo", "--balance", "round-robin", "--mode", "mixed", "--blend", "order"}).options);
+    CHECK(parse({"demo", "--distribution", "owned", "--mode", "image", "--live"}).options);
+    checkRefused({"--spacing", "1,1,2"}); // a generated scene is no file
+    checkRefused({"--origin", "1,1,2", "--no-fit"});
+    checkRefused({"--xyz-frame", "2"});
+    checkRefused({"--no-fit"});
+    CHECK(parse({"demo", "--no-fit=false"}).options);
+    const ParsedOptions parsed = parse({"a_2x2x2_uint8.raw", "--origin", "1,1,2"}); // is centred
+    CHECK_FALSE(parsed.options);
+    CHECK(test::contains(parsed.message, "--origin: needs --no-fit"));
+    CHECK(parse({"a_2x2x2_uint8.raw:clip=0,0,0,1,1,1", "--origin", "1,1,2"}).options);
+    CHECK(parse({"a_2x2x2_uint8.raw", "--origin", "1,1,2", "--no-fit"}).options);
+}
+
 TEST_CASE("Two files with one name are refused", "[options]")
 {
     checkRefused({"--depth", "a.pfm", "--alpha", "a.pfm"});
