@@ -84,6 +84,7 @@ public:
             refuseForFiles();
             readScene();
             app_.get_option("--ao")->default_str(std::to_string(options_.aoRays));
+            app_.get_option("--deep")->default_str(std::to_string(options_.deep));
             options_.values = values(false);
             options_.given = values(true);
         } catch (const CLI::CallForHelp&) {

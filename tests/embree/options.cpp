@@ -409,6 +409,7 @@ TEST_CASE("The options are there as they count, for the record", "[options]")
         return std::count(options.values.begin(), options.values.end(),
                           std::pair<std::string, std::string>(name, text));
     };
+    CHECK(has(options({"demo", "--interleave", "4"}), "deep", "4") == 1);
     CHECK(has(options({"demo", "--shadows=false"}), "shadows", "false") == 1);
     CHECK(has(options({"demo", "--shadows=true"}), "shadows", "true") == 1);
 }
