@@ -147,7 +147,7 @@ private:
     {
         flag("--no-fit", noFit_,
              "Leave files in their own coordinates; default: each is scaled and centred to fill the unit cube");
-        number("--xyz-frame", options_.xyzFrame, 1, 2147483647, "N",
+        number("--xyz-frame", options_.xyzFrame, 1, 2147483646, "N",
                "Which frame of an .xyz file that has several, from 1; default 1");
         text("--spacing", spacing_, "X,Y,Z",
              "Distances between the voxels of volumes along their three axes, as in 1,1,2 for slices that are twice as "

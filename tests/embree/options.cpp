@@ -189,7 +189,7 @@ TEST_CASE("What is wrong on the command line is refused in one line that names i
             checkRefused({option, value});
     checkRefused({"--fov", "0"});
     checkRefused({"--camera-distance", "-1"});
-    for (const std::string value : {"0", "-1", "1.5", "last"})
+    for (const std::string value : {"0", "-1", "1.5", "last", "2147483647"})
         checkRefused({"--xyz-frame", value});
     checkRefused({"--interleave", "4096", "--bricks", "1048576"}); // more cells than an int can count
     checkRefused({"--interleave", "17", "--bricks", "1048576"});
