@@ -123,6 +123,7 @@ inline Scene syntheticScene(int brickCount, std::uint64_t seed, const LookOf& lo
         dims[axis] = 64 * scene.grid[axis];
     auto field = std::make_shared<const detail::WaveField>(dims, seed);
     VolumeSource source = detail::generatedVolume(dims, [field](int x, int y, int z) { return (*field)(x, y, z); });
+    source.name = "synthetic";
     if (lookOf)
         source.look = lookOf(source);
     scene.add(std::move(source), true);
@@ -143,6 +144,7 @@ inline Scene demoScene(std::uint64_t seed, const LookOf& lookOf = {})
         return inside == 0 ? 0.0f : std::min(1.0f, inside * (0.10f + 1.9f * (*waves)(x, y, z)));
     };
     VolumeSource source = detail::generatedVolume({size, size, size}, cloud);
+    source.name = "demo";
     if (lookOf)
         source.look = lookOf(source);
     scene.add(std::move(source), true);

@@ -2,6 +2,7 @@
 #include "support.hpp"
 #include "together.hpp"
 
+#include <generated.hpp>
 #include <rank_scene.hpp>
 
 #include <dfb/tile.hpp>
@@ -84,6 +85,11 @@ TEST_CASE("Path tracing says that it leaves volumes out", "[scene]")
     CHECK(test::contains(notesOf({volume, mesh, "--path", "2"})[0], "--path leaves volumes out"));
     CHECK(notesOf({mesh, "--path", "2"}).empty());
     CHECK(notesOf({volume}).empty());
+}
+
+TEST_CASE("A generated volume that is too large is named", "[scene]")
+{
+    CHECK(test::isLineWith(test::errorOf([] { syntheticScene(2053, 1); }), "synthetic: its voxels are too small"));
 }
 
 TEST_CASE("A range that a float cannot divide by is named", "[scene]")
