@@ -257,8 +257,9 @@ private:
         LivePicture picture;
         picture.wishes = wishes_;
         const Focus& focus = scene_->info.focus;
-        picture.distance = cameraDistance(focus, settings_.view, settings_.width, settings_.height)
-                           / static_cast<double>(focus.box.largestExtent());
+        picture.distance = cameraDistance(focus, settings_.view, settings_.width, settings_.height);
+        if (focus.box.largestExtent() > 0)
+            picture.distance /= static_cast<double>(focus.box.largestExtent());
         picture.samples = std::max(1, samples_);
         picture.camera = words(picture.samples);
         picture.tileSize = fb_.layout().tileSize();
