@@ -20,7 +20,7 @@ from collections import defaultdict
 
 COLOURS = ["#0a58a8", "#c03020", "#2a8a2a", "#8a5a00", "#703090", "#607050"]
 # Options that say how many ranks there are, or what is written and not how long it takes.
-NOT_COMPARED = {"ranks", "stats", "output", "alpha", "depth", "aux", "frames", "seed"}
+NOT_COMPARED = {"ranks", "stats", "trace", "output", "cinema", "alpha", "depth", "aux", "frames", "seed"}
 
 
 class Run:
@@ -33,6 +33,8 @@ class Run:
         self.render = [frame["render_ms"] for frame in stats["frames"]]
         self.compositing = [frame["compositing_ms"] for frame in stats["frames"]]
         self.times = [a + b for a, b in zip(self.render, self.compositing)]
+        if not self.times:
+            raise ValueError(path + " has no frames")
 
     def median(self, values):
         return statistics.median(values[1:] if len(values) > 1 else values)
@@ -137,7 +139,7 @@ def main():
         sys.exit(__doc__)
     try:
         series = series_of([Run(path) for path in sys.argv[2:]])
-    except (OSError, ValueError, KeyError) as wrong:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as wrong:
         sys.exit("plot_stats.py: no statistics of dfb_render: {}".format(wrong))
     print_table(series)
     if sys.argv[1] == "--table":

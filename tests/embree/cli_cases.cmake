@@ -996,12 +996,24 @@ elseif(CASE STREQUAL "plots")
   if(NOT out MATCHES "\\| 4 \\| 4 \\| 40.0 \\| 25.00 \\| 30.0 \\| 10.0 \\|")
     wrong("unexpected table")
   endif()
-  file(WRITE ${work}/wrong.json "{}")
-  execute_process(COMMAND ${PYTHON} ${PLOT_STATS} plot wrong.json WORKING_DIRECTORY ${work} RESULT_VARIABLE code
-    OUTPUT_VARIABLE out ERROR_VARIABLE err)
-  if(code EQUAL 0 OR NOT err MATCHES "no statistics of dfb_render")
-    wrong("expected to be told what is wrong")
+  # What is written makes no other series.
+  foreach(name a b)
+    file(WRITE ${work}/${name}.json "{\"ranks\": 4, \"scene\": [\"a.ply\"], \"options\": {\"mode\": \"data\",
+      \"trace\": \"${name}\", \"cinema\": \"${name}\"}, \"frames\": [{\"render_ms\": 30, \"compositing_ms\": 10}]}")
+  endforeach()
+  execute_process(COMMAND ${PYTHON} ${PLOT_STATS} --table a.json b.json WORKING_DIRECTORY ${work} OUTPUT_VARIABLE out
+    RESULT_VARIABLE code ERROR_VARIABLE err)
+  if(NOT code EQUAL 0 OR out MATCHES "trace|cinema")
+    wrong("expected one series")
   endif()
+  foreach(text "{}" "[]" "{\"ranks\": 4, \"scene\": [], \"options\": {}, \"frames\": []}")
+    file(WRITE ${work}/wrong.json "${text}")
+    execute_process(COMMAND ${PYTHON} ${PLOT_STATS} plot wrong.json WORKING_DIRECTORY ${work} RESULT_VARIABLE code
+      OUTPUT_VARIABLE out ERROR_VARIABLE err)
+    if(code EQUAL 0 OR NOT err MATCHES "^plot_stats.py: [^\n]*no statistics of dfb_render[^\n]*\n$")
+      wrong("expected to be told what is wrong with ${text}")
+    endif()
+  endforeach()
 
 elseif(CASE STREQUAL "hash")
   set(scene demo --size 96x64 --bricks 5)
