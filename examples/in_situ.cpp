@@ -266,7 +266,7 @@ void renderSlab(const GrayScott& fields, const dfb::PerspectiveCamera& camera, c
 // ---- both together ---------------------------------------------------------------------------------------------
 
 struct Options {
-    int size = 96, steps = 0, every = 80, slabs = 8;
+    int size = 96, steps = 0, every = 80, slabs = 0;
     std::string out; // empty: no pictures are written
     std::optional<int> live;
 };
@@ -276,7 +276,8 @@ constexpr const char* usage =
     "  --size N      voxels along each side of the grid (96)\n"
     "  --steps N     steps of the simulation (1600; with --live: until it is ended)\n"
     "  --every N     render a picture after every N steps (80)\n"
-    "  --slabs N     slabs that the grid is cut into, which are dealt out to the ranks (8)\n"
+    "  --slabs N     slabs that the grid is cut into, which are dealt out to the ranks (8, or\n"
+    "                half of --size if that is less)\n"
     "  --out PREFIX  pictures to write: PREFIX_0000.ppm, PREFIX_0001.ppm ... (in_situ; with --live: none)\n"
     "  --live [PORT] show the pictures in a browser on this machine (port 8080, or any free port)\n"
     "Exit code: 0: done, 1: the run failed, 2: the command line is wrong.\n";
@@ -317,6 +318,8 @@ Options parse(int argc, char** argv)
         options.out = "in_situ";
     if (options.size < 8 || options.size > 1024)
         throw std::invalid_argument("--size must be 8 to 1024");
+    if (options.slabs == 0)
+        options.slabs = std::min(8, options.size / 2);
     if (options.slabs > options.size / 2) // ghosts come from the adjacent slab only
         throw std::invalid_argument("--slabs must be half of --size at most: a slab has two layers or more");
     return options;
