@@ -40,13 +40,6 @@ Scene makeScene(const Options& options, int brickCount, const Loaders& loaders)
     return scene;
 }
 
-// Whether a rank holds a brick: `copies` consecutive ranks do.
-bool holdsBrick(int rank, int brick, int brickCount, int rankCount, int copies)
-{
-    const int first = rankOfBrick(brick, brickCount, rankCount);
-    return (rank - first + rankCount) % rankCount < copies;
-}
-
 // Whether the scene is a body in computed tomography, which stands along z: by the usual convention its slices go from
 // the feet to the head.
 bool stands(const Scene& scene)
@@ -120,7 +113,8 @@ RankScene loadRankScene(const Options& options, const Loaders& loaders)
              c += static_cast<std::size_t>(brickCount))
             bounds.grow(cells[c]);
         result.bounds.push_back(bounds);
-        if (!isImage && !holdsBrick(rank, brick, brickCount, rankCount, copies))
+        const Holders& held = holders[static_cast<std::size_t>(brick)]; // those of all its cells
+        if ((rank - held.first + rankCount) % rankCount >= held.count)
             continue;
         const auto id = static_cast<std::uint32_t>(brick);
         result.brickIds.push_back(id);
