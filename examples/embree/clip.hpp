@@ -2,10 +2,10 @@
 #pragma once
 
 #include "file_look.hpp"
+#include "text.hpp"
 #include "vec.hpp"
 
 #include <cmath>
-#include <cstdio>
 #include <optional>
 #include <string>
 
@@ -153,12 +153,6 @@ inline Vec3 clamped(const Vec3& p, const Box& box)
             std::clamp(p.z, box.lo.z, box.hi.z)};
 }
 
-inline std::string textOf(float value)
-{
-    char text[32];
-    std::snprintf(text, sizeof text, "%g", static_cast<double>(value));
-    return text;
-}
 inline std::string textOf(const Vec3& v) { return textOf(v.x) + ',' + textOf(v.y) + ',' + textOf(v.z); }
 
 } // namespace example

@@ -1,6 +1,7 @@
 // HeaderLines: the lines of text at the beginning of a volume's file, and the values in a line.
 #pragma once
 
+#include "text.hpp"
 #include "volume_file.hpp"
 
 #include <istream>
@@ -124,12 +125,6 @@ public:
 private:
     static constexpr std::int64_t most = 1 << 20;
 
-    static std::string textOf(double value)
-    {
-        char text[32];
-        std::snprintf(text, sizeof text, "%g", value);
-        return text;
-    }
     static Vec3 vec(const std::array<double, 3>& v) { return toFloat(Vec3d{v[0], v[1], v[2]}); }
 
     std::istream& stream_;

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <charconv>
 #include <cstddef>
+#include <cstdio>
 #include <exception>
 #include <new>
 #include <string>
@@ -22,6 +23,14 @@ inline std::string reasonOf(const std::exception& e)
     const bool lacksMemory = dynamic_cast<const std::bad_alloc*>(&e) != nullptr;
     return std::string(e.what()) + (lacksMemory ? ": too little memory; of several ranks each needs less" : "");
 }
+
+inline std::string textOf(double value)
+{
+    char text[32];
+    std::snprintf(text, sizeof text, "%g", value);
+    return text;
+}
+inline std::string textOf(float value) { return textOf(static_cast<double>(value)); }
 
 // The ending of a path, with its dot; empty if there is none.
 inline std::string endingOf(const std::string& path) { return path.substr(std::min(path.rfind('.'), path.size())); }

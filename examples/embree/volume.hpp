@@ -13,6 +13,7 @@
 #include "loaders.hpp"
 #include "meta_image.hpp"
 #include "nrrd.hpp"
+#include "text.hpp"
 #include "vec.hpp"
 #include "volume_file.hpp"
 #include "volume_look.hpp"
@@ -124,12 +125,9 @@ inline void setRange(VolumeInfo& info, const VoxelRange& range, bool isFloat, co
             info.maximum = hi;
         }
     }
-    if (!std::isnormal(info.maximum - info.minimum) || !std::isfinite(info.maximum - info.least)) {
-        char ends[64];
-        std::snprintf(ends, sizeof ends, "%g to %g", static_cast<double>(lo), static_cast<double>(hi));
-        throw std::runtime_error(name + ": its values go from " + ends
+    if (!std::isnormal(info.maximum - info.minimum) || !std::isfinite(info.maximum - info.least))
+        throw std::runtime_error(name + ": its values go from " + textOf(lo) + " to " + textOf(hi)
                                  + ", of which no image can be made; is the byte order right?");
-    }
 }
 
 inline std::size_t voxelsOfBox(const Index3& lo, const Index3& hi)
