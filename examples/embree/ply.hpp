@@ -5,7 +5,10 @@
 #pragma once
 
 #include "mesh.hpp"
+#include "voxels.hpp"
 
+#include <algorithm>
+#include <array>
 #include <charconv>
 #include <cmath>
 #include <cstring>
@@ -16,20 +19,11 @@ namespace example {
 
 namespace detail {
 
-enum class PlyType { Int8, UInt8, Int16, UInt16, Int32, UInt32, Float32, Float64 };
-
-// The bytes of a value in a binary file.
-inline std::size_t plyBytes(PlyType type)
-{
-    static const std::array<std::size_t, 8> sizes{1, 1, 2, 2, 4, 4, 4, 8};
-    return sizes[static_cast<std::size_t>(type)];
-}
-
 struct PlyProperty {
     std::string name;
-    PlyType type = PlyType::Float32;
+    FileType type = FileType::Float32;
     bool isList = false;
-    PlyType countType = PlyType::UInt8;
+    FileType countType = FileType::UInt8;
     int channel = -1; // 0, 1 or 2: red, green or blue
 };
 
@@ -168,7 +162,7 @@ public:
     const std::vector<PlyElement>& elements() const { return elements_; }
     bool isAscii() const { return format_ == Format::Ascii; }
     std::size_t position() const { return at_; }
-    double number(PlyType type, const PlyElement& element, std::uint64_t row)
+    double number(FileType type, const PlyElement& element, std::uint64_t row)
     {
         const auto where = [&] {
             return " in " + element.name + ' ' + std::to_string(row) + " of " + std::to_string(element.count);
@@ -187,32 +181,17 @@ public:
                 fail("expected a number," + where());
             return value;
         }
-        const std::size_t size = plyBytes(type);
-        if (bytes_.size() - at_ < size)
-            fail("it ends early," + where());
-        std::uint64_t bits = 0;
-        for (std::size_t i = 0; i < size; ++i) {
-            const std::size_t shift = format_ == Format::LittleEndian ? i : size - 1 - i;
-            bits |= static_cast<std::uint64_t>(static_cast<unsigned char>(bytes_[at_ + i])) << (8 * shift);
-        }
-        at_ += size;
-        switch (type) {
-        case PlyType::Int8: return static_cast<std::int8_t>(bits);
-        case PlyType::Int16: return static_cast<std::int16_t>(bits);
-        case PlyType::Int32: return static_cast<std::int32_t>(bits);
-        case PlyType::Float32: {
-            const std::uint32_t low = static_cast<std::uint32_t>(bits);
-            float value;
-            std::memcpy(&value, &low, sizeof value);
+        return withFileType(type, [&](auto value) {
+            if (bytes_.size() - at_ < sizeof value)
+                fail("it ends early," + where());
+            char bytes[sizeof value];
+            std::memcpy(bytes, bytes_.data() + at_, sizeof value);
+            if (format_ == Format::BigEndian)
+                std::reverse(bytes, bytes + sizeof value);
+            std::memcpy(&value, bytes, sizeof value);
+            at_ += sizeof value;
             return static_cast<double>(value);
-        }
-        case PlyType::Float64: {
-            double value;
-            std::memcpy(&value, &bits, sizeof value);
-            return value;
-        }
-        default: return static_cast<double>(bits);
-        }
+        });
     }
 
     void setBytes(std::string_view bytes)
@@ -274,26 +253,20 @@ private:
 
     static bool isIndexList(const PlyProperty& p) { return p.name == "vertex_indices" || p.name == "vertex_index"; }
 
-    PlyType typeOf(const std::string& word) const
+    FileType typeOf(const std::string& word) const
     {
-        static const std::array<std::array<const char*, 2>, 8> names{{{"char", "int8"},
-                                                                      {"uchar", "uint8"},
-                                                                      {"short", "int16"},
-                                                                      {"ushort", "uint16"},
-                                                                      {"int", "int32"},
-                                                                      {"uint", "uint32"},
-                                                                      {"float", "float32"},
-                                                                      {"double", "float64"}}};
-        for (std::size_t i = 0; i < names.size(); ++i)
-            if (word == names[i][0] || word == names[i][1])
-                return static_cast<PlyType>(i);
+        static const std::array<const char*, 8> others{"uchar", "char", "ushort", "short",
+                                                       "uint",  "int",  "float",  "double"};
+        for (std::size_t i = 0; i < others.size(); ++i)
+            if (word == others[i] || word == fileTypes()[i].first)
+                return fileTypes()[i].second;
         fail("unknown type '" + word + "'");
     }
 
     // The value of a channel at full intensity.
-    static double largestOf(PlyType type)
+    static double largestOf(FileType type)
     {
-        static const std::array<double, 8> all{127, 255, 32767, 65535, 255, 255, 1, 1}; // 32-bit integers: as bytes
+        static const std::array<double, 8> all{255, 127, 65535, 32767, 255, 255, 1, 1}; // 32-bit integers: as bytes
         return all[static_cast<std::size_t>(type)];
     }
 

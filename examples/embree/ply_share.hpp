@@ -122,10 +122,10 @@ private:
         int lists = 0;
         for (const PlyProperty& property : element.properties) {
             if (!property.isList) {
-                bytes += plyBytes(property.type);
+                bytes += fileBytes(property.type);
                 continue;
             }
-            const std::uint64_t place = at + bytes, width = plyBytes(property.countType);
+            const std::uint64_t place = at + bytes, width = fileBytes(property.countType);
             if (++lists > 1 || !element.isFace() || place + width > size_)
                 return 0;
             const std::string count = readBytes(path_, place, place + width, loaders_);
@@ -133,7 +133,7 @@ private:
             const double vertices = reader_.number(property.countType, element, 0);
             if (!(vertices >= 3 && vertices <= 65536))
                 return 0;
-            bytes += width + static_cast<std::uint64_t>(vertices) * plyBytes(property.type);
+            bytes += width + static_cast<std::uint64_t>(vertices) * fileBytes(property.type);
         }
         return bytes;
     }

@@ -68,15 +68,17 @@ auto withFileType(FileType type, const Function& function)
     }
 }
 
+inline std::size_t fileBytes(FileType type)
+{
+    return withFileType(type, [](auto value) { return sizeof value; });
+}
+
 // How voxels are stored in a file.
 struct VoxelFormat {
     FileType type = FileType::UInt8;
     bool isBigEndian = false;
 
-    std::size_t bytes() const
-    {
-        return withFileType(type, [](auto voxel) { return sizeof voxel; });
-    }
+    std::size_t bytes() const { return fileBytes(type); }
     bool isFloat() const { return type == FileType::Float32 || type == FileType::Float64; }
     VoxelType inMemory() const
     {
