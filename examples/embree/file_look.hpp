@@ -4,6 +4,7 @@
 #pragma once
 
 #include "mesh.hpp"
+#include "text.hpp"
 
 #include <array>
 #include <cstddef>
@@ -76,6 +77,18 @@ inline std::vector<float> numbersOf(const std::string& text, std::size_t count)
         numbers.push_back(*number);
     }
     return count == 0 || numbers.size() == count ? numbers : std::vector<float>();
+}
+
+// Returns an empty string if the path ends in one of `endings`, otherwise what is wrong with it, as CLI11 wants it.
+inline std::string checkEnding(const std::string& path, const std::vector<std::string>& endings)
+{
+    std::string all;
+    for (const std::string& ending : endings) {
+        if (endingOf(path) == ending && path.size() > ending.size())
+            return {};
+        all += (all.empty() ? "" : ", ") + ending;
+    }
+    return "'" + path + "' has an unknown ending, expected " + all;
 }
 
 } // namespace detail
@@ -169,14 +182,9 @@ inline bool setLook(FileLook& look, const std::string& key, const std::string& v
 // have colons. Throws std::invalid_argument if a key is unknown or its value is wrong.
 inline SceneFile parseSceneFile(const std::string& word, const std::vector<std::string>& endings)
 {
-    const auto endsAsFile = [&endings](const std::string& path) {
-        return std::any_of(endings.begin(), endings.end(), [&path](const std::string& e) {
-            return path.size() > e.size() && path.compare(path.size() - e.size(), e.size(), e) == 0;
-        });
-    };
     SceneFile file{word, {}};
     std::vector<std::pair<std::string, std::string>> settings; // from the last to the first
-    while (!endsAsFile(file.path)) {
+    while (!detail::checkEnding(file.path, endings).empty()) {
         const std::size_t colon = file.path.rfind(':'), equals = file.path.find('=', std::min(colon, file.path.size()));
         if (colon == std::string::npos || equals == std::string::npos)
             break;

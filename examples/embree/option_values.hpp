@@ -19,18 +19,6 @@
 namespace example {
 namespace detail {
 
-// Returns an empty string if the path ends in one of `endings`, otherwise what is wrong with it, as CLI11 wants it.
-inline std::string checkEnding(const std::string& path, const std::vector<std::string>& endings)
-{
-    std::string all;
-    for (const std::string& ending : endings) {
-        if (endingOf(path) == ending && path.size() > ending.size())
-            return {};
-        all += (all.empty() ? "" : ", ") + ending;
-    }
-    return "'" + path + "' has an unknown ending, expected " + all;
-}
-
 inline CLI::Validator ending(std::vector<std::string> endings)
 {
     return CLI::Validator([endings](std::string& path) { return checkEnding(path, endings); }, "");
