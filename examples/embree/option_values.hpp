@@ -14,6 +14,7 @@
 #include <cstdlib>
 #include <sstream>
 #include <string>
+#include <string_view>
 #include <vector>
 
 namespace example {
@@ -76,37 +77,26 @@ inline std::string wrapped(std::string text)
 inline void parseSize(const std::string& name, const std::string& text, int most, int& width, int& height)
 {
     const std::size_t x = text.find('x');
-    const auto side = [&](std::size_t from, std::size_t to) {
+    const auto side = [most](std::string_view word) {
         int value = 0;
-        bool ok = from < to;
-        for (; from < to && ok; ++from) {
-            ok = text[from] >= '0' && text[from] <= '9' && value <= most;
-            value = ok ? 10 * value + (text[from] - '0') : 0;
-        }
-        return ok && value >= 1 && value <= most ? value : 0;
+        return parseNumber(word, value) && value >= 1 && value <= most ? value : 0;
     };
-    width = x == std::string::npos ? 0 : side(0, x);
-    height = x == std::string::npos ? 0 : side(x + 1, text.size());
+    const std::string_view both = text;
+    width = side(both.substr(0, x));
+    height = x == std::string::npos ? 0 : side(both.substr(x + 1));
     if (width == 0 || height == 0)
         throw CLI::ValidationError(name, "'" + text + "' is no pair of numbers such as 4x3, each from 1 to "
                                              + std::to_string(most));
 }
 
 // Three numbers within [lo, hi], as in R,G,B; `what` describes them in the error.
-inline std::array<float, 3> parseThree(const std::string& name, const std::string& text, double lo, double hi,
+inline std::array<float, 3> parseThree(const std::string& name, const std::string& text, float lo, float hi,
                                        const std::string& what)
 {
-    std::array<float, 3> values{};
-    std::size_t begin = 0;
-    for (std::size_t c = 0; c < 3; ++c) {
-        const std::size_t end = c < 2 ? text.find(',', begin) : text.size();
-        std::string part = end == std::string::npos ? "" : text.substr(begin, end - begin);
-        if (part.empty() || part[0] == ' ' || !number(lo, hi)(part).empty())
-            throw CLI::ValidationError(name, "'" + text + "' is not " + what);
-        values[c] = std::strtof(part.c_str(), nullptr);
-        begin = end + 1;
-    }
-    return values;
+    const std::vector<float> values = numbersOf(text, 3);
+    if (values.empty() || std::any_of(values.begin(), values.end(), [&](float v) { return !(v >= lo && v <= hi); }))
+        throw CLI::ValidationError(name, "'" + text + "' is not " + what);
+    return {values[0], values[1], values[2]};
 }
 
 // The channels that an .exr has besides colour, from the words of --layers.

@@ -312,10 +312,10 @@ private:
                 detail::parseThree("--background", background_, 0, 1, "R,G,B with three numbers from 0 to 1");
         if (app_.count("--spacing") > 0)
             options_.spacing =
-                detail::parseThree("--spacing", spacing_, 1e-15, 1e9, "X,Y,Z with three distances from 1e-15 to 1e9");
+                detail::parseThree("--spacing", spacing_, 1e-15f, 1e9f, "X,Y,Z with three distances from 1e-15 to 1e9");
         if (app_.count("--origin") > 0)
             options_.origin =
-                detail::parseThree("--origin", origin_, -1e12, 1e12, "X,Y,Z with three numbers of at most 1e12");
+                detail::parseThree("--origin", origin_, -1e12f, 1e12f, "X,Y,Z with three numbers of at most 1e12");
     }
 
     static bool isFlag(const CLI::Option& option) { return option.get_expected_max() == 0; }
