@@ -5,15 +5,33 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <functional>
 #include <future>
+#include <mutex>
 #include <thread>
+#include <utility>
+#include <vector>
 
-// Measures for how long this process stood still at most: a thread sleeps again and again, and may wake up late.
+#if defined(__linux__)
+#include <pthread.h>
+#include <sched.h>
+#endif
+
+// Measures for how long a processor of this process stood still at most. On each processor a thread sleeps again and
+// again, and may wake up late. It also sees how long the other threads have been asleep.
 class StandStill {
 public:
     using Clock = std::chrono::steady_clock;
 
-    StandStill() = default;
+    // `onLonger` is called when a standstill is longer than all before, by one thread at a time.
+    explicit StandStill(std::function<void(Clock::duration)> onLonger = [](Clock::duration) {})
+        : onLonger_(std::move(onLonger)), processors_(ownProcessors()), awake_(processors_.size())
+    {
+        for (auto& time : awake_)
+            time = Clock::now();
+        for (std::size_t i = 0; i < processors_.size(); ++i)
+            threads_.emplace_back([this, i] { watch(i); });
+    }
     StandStill(const StandStill&) = delete;
     StandStill& operator=(const StandStill&) = delete;
     ~StandStill() { end(); }
@@ -22,25 +40,57 @@ public:
     Clock::duration end()
     {
         over_ = true;
-        if (thread_.joinable())
-            thread_.join();
+        for (std::thread& thread : threads_)
+            thread.join();
+        threads_.clear();
         return longest_;
     }
 
 private:
-    void watch()
+    // The processors that this process may run on; {-1} if they are not known.
+    static std::vector<int> ownProcessors()
     {
-        for (auto last = Clock::now(); !over_;) {
+        std::vector<int> processors;
+#if defined(__linux__)
+        cpu_set_t mask;
+        if (sched_getaffinity(0, sizeof mask, &mask) == 0)
+            for (int i = 0; i < CPU_SETSIZE; ++i)
+                if (CPU_ISSET(static_cast<unsigned>(i), &mask))
+                    processors.push_back(i);
+#endif
+        return processors.empty() ? std::vector<int>{-1} : processors;
+    }
+
+    void watch(std::size_t own)
+    {
+#if defined(__linux__)
+        if (processors_[own] >= 0) {
+            cpu_set_t mask;
+            CPU_ZERO(&mask);
+            CPU_SET(static_cast<unsigned>(processors_[own]), &mask);
+            pthread_setaffinity_np(pthread_self(), sizeof mask, &mask);
+        }
+#endif
+        while (!over_) {
             std::this_thread::sleep_for(std::chrono::milliseconds(5));
             const auto now = Clock::now();
-            longest_ = std::max(longest_, now - last);
-            last = now;
+            const std::lock_guard<std::mutex> lock(mutex_);
+            for (const auto time : awake_)
+                if (now - time > longest_) {
+                    longest_ = now - time;
+                    onLonger_(longest_);
+                }
+            awake_[own] = now;
         }
     }
 
-    std::atomic<bool> over_{false};
+    const std::function<void(Clock::duration)> onLonger_;
+    const std::vector<int> processors_;
+    std::mutex mutex_;
+    std::vector<Clock::time_point> awake_; // when each thread was last awake
     Clock::duration longest_{};
-    std::thread thread_{[this] { watch(); }};
+    std::atomic<bool> over_{false};
+    std::vector<std::thread> threads_; // one for each processor
 };
 
 struct IfItStoodStill {
