@@ -2,9 +2,9 @@
 // Then time-outs may pass that nothing in the case has caused.
 #pragma once
 
-#include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <cstddef>
 #include <functional>
 #include <future>
 #include <mutex>
@@ -25,10 +25,8 @@ public:
 
     // `onLonger` is called when a standstill is longer than all before, by one thread at a time.
     explicit StandStill(std::function<void(Clock::duration)> onLonger = [](Clock::duration) {})
-        : onLonger_(std::move(onLonger)), processors_(ownProcessors()), awake_(processors_.size())
+        : onLonger_(std::move(onLonger)), processors_(ownProcessors()), awake_(processors_.size(), Clock::now())
     {
-        for (auto& time : awake_)
-            time = Clock::now();
         for (std::size_t i = 0; i < processors_.size(); ++i)
             threads_.emplace_back([this, i] { watch(i); });
     }
