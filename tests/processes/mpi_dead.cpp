@@ -7,9 +7,13 @@
 //     reaction: abort (the default: MPI_Abort), handler (the other ranks go on, as far as they can)
 // Most launchers end a job when a rank dies, or do not let it live on. Therefore each process forks first. The process
 // that the launcher sees lives until all ranks have got their errors, whatever happens to the rank itself. So only the
-// library can notice the loss. mpi_dead.cmake starts this program and checks its output:
-//   mpi_dead: rank 0 told of rank 3 after 1234 ms, gone after 5 ms: <error>
-// <folder> must be empty.
+// library can notice the loss. mpi_dead.cmake starts this program and checks what it writes into <folder>, which must
+// be empty:
+//   told.<rank>   "rank 0 told of rank 3 after 1234 ms, gone after 5 ms: <error>"
+//   lost_at       when the rank was lost, in s since 1970
+//   stood_still   is there if another rank stood still, so that it may rightly have been taken for lost
+#include "undisturbed.hpp"
+
 #include <dfb/dfb.hpp>
 
 #include <algorithm>
@@ -22,6 +26,7 @@
 #include <fstream>
 #include <functional>
 #include <memory>
+#include <optional>
 #include <string>
 #include <thread>
 
@@ -56,6 +61,13 @@ bool exists(const std::string& path)
     return stat(path.c_str(), &status) == 0;
 }
 
+// Writes a file that is complete as soon as it is there.
+void write(const std::string& path, const std::string& text)
+{
+    std::ofstream(path + ".new") << text << '\n';
+    std::rename((path + ".new").c_str(), path.c_str());
+}
+
 // Whether all ranks that can be told have been. The size of the job is in a file, as this process is not in MPI.
 bool allTold(const Run& run)
 {
@@ -76,6 +88,9 @@ bool othersTold(const Run& run)
 // The other ranks read the time of the loss from a file. The clock is that of the host.
 void die(const Run& run)
 {
+    using namespace std::chrono;
+    std::ofstream(run.folder + "/lost_at")
+        << duration_cast<seconds>(system_clock::now().time_since_epoch()).count() << '\n';
     std::ofstream(run.folder + "/lost") << Clock::now().time_since_epoch().count();
     if (run.how == "kill")
         raise(SIGKILL);
@@ -143,11 +158,15 @@ void runRank(const Run& run, int& argc, char**& argv)
 {
     dfb::MpiSession mpi(argc, argv);
     mpi.giveUp(); // MPI_Finalize would wait for ever
-    if (mpi.rank() == 0) {
-        std::ofstream(run.folder + "/size.new") << mpi.size() << '\n';
-        std::rename((run.folder + "/size.new").c_str(), (run.folder + "/size").c_str());
-    }
+    if (mpi.rank() == 0)
+        write(run.folder + "/size", std::to_string(mpi.size()));
     const bool isVictim = mpi.rank() == run.victim;
+    std::optional<StandStill> standStill;
+    if (!isVictim)
+        standStill.emplace([&run](Clock::duration longest) {
+            if (longest >= milliseconds(300))
+                std::ofstream(run.folder + "/stood_still") << '\n';
+        });
     std::atomic<bool> handlerCalled{false};
     std::string text, lateText;
     dfb::NetworkConfig options;
@@ -173,7 +192,8 @@ void runRank(const Run& run, int& argc, char**& argv)
             };
             std::unique_ptr<FrameBuffer> fb;
             if (run.where == "constructor") {
-                std::this_thread::sleep_for(milliseconds(200)); // until each has heard that the others answer
+                MPI_Barrier(mpi.communicator());
+                std::this_thread::sleep_for(milliseconds(500)); // until each has heard that the others answer
             } else {
                 fb = make();
                 emptyFrame(*fb);
@@ -212,29 +232,25 @@ void runRank(const Run& run, int& argc, char**& argv)
         lost = run.victim;
         toldMs = goneMs;
     }
-    std::printf("mpi_dead: rank %d told of rank %d after %.0f ms, gone after %.0f ms: %s\n", mpi.rank(), lost, toldMs,
-                goneMs, text.c_str());
-    std::fflush(stdout);
-    std::ofstream note(noteOf(run, mpi.rank()));
+    standStill.reset();
+    char told[100];
+    std::snprintf(told, sizeof told, "rank %d told of rank %d after %.0f ms, gone after %.0f ms: ", mpi.rank(), lost,
+                  toldMs, goneMs);
+    write(noteOf(run, mpi.rank()), told + text);
 }
 
 // What the launcher sees: goes on until all have been told.
 int watch(const Run& run, pid_t child)
 {
-    bool childIsThere = true, resumed = false;
-    for (const auto end = Clock::now() + std::chrono::seconds(25); Clock::now() < end;) {
+    bool childIsThere = true;
+    for (const auto end = Clock::now() + std::chrono::seconds(80); Clock::now() < end && !allTold(run);) {
         int status = 0;
         if (childIsThere && waitpid(child, &status, WNOHANG) == child)
             childIsThere = false;
-        if (run.how == "resume" && !resumed && othersTold(run)) {
-            resumed = true;
-            kill(child, SIGCONT);
-        }
-        if (allTold(run))
-            break;
+        if (run.how == "resume" && childIsThere && othersTold(run))
+            kill(child, SIGCONT); // again and again, as it may not have stopped yet
         std::this_thread::sleep_for(milliseconds(20));
     }
-    std::this_thread::sleep_for(milliseconds(200)); // what was printed is on its way
     if (childIsThere) {
         kill(child, SIGKILL);
         waitpid(child, nullptr, 0);

@@ -1,5 +1,5 @@
-# Runs the command behind "--", followed by `arguments` if that is set, for at most 60 s. Sets `code`, `out`, `err`, and
-# `seconds`, the time that it took.
+# Runs the command behind "--", followed by `arguments` if that is set, for at most 120 s. Sets `code`, `out`, `err`,
+# and `seconds`, the time that it took.
 set(command "")
 set(own OFF)
 foreach(i RANGE ${CMAKE_ARGC})
@@ -11,7 +11,7 @@ foreach(i RANGE ${CMAKE_ARGC})
 endforeach()
 string(TIMESTAMP start "%s" UTC)
 execute_process(COMMAND ${command} ${arguments}
-  RESULT_VARIABLE code OUTPUT_VARIABLE out ERROR_VARIABLE err TIMEOUT 60)
+  RESULT_VARIABLE code OUTPUT_VARIABLE out ERROR_VARIABLE err TIMEOUT 120)
 string(TIMESTAMP end "%s" UTC)
 math(EXPR seconds "${end} - ${start}")
 message(STATUS "${seconds} s, code ${code}\n${out}${err}")
