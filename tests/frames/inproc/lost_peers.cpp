@@ -226,12 +226,16 @@ TEST_CASE("A rank that stops answering is named by all others, in whatever call 
 TEST_CASE("A frame that is open while rendering fails when a rank is lost, and says so before end()", "[lost_peers]")
 {
     std::atomic<int> failed{0};
-    const auto told = lose(3, 2, true, [&](const std::shared_ptr<dfb::Connection>&, std::unique_ptr<FrameBuffer>& fb) {
+    const auto render = [&](const std::shared_ptr<dfb::Connection>&, std::unique_ptr<FrameBuffer>& fb) {
         auto frame = begin(*fb);
         for (const auto start = Clock::now(); !frame.failed() && Clock::now() - start < std::chrono::seconds(10);)
             std::this_thread::sleep_for(milliseconds(1));
         failed += frame.failed();
         frame.end();
+    };
+    const auto told = undisturbed([&] {
+        failed = 0;
+        return lose(3, 2, true, render);
     });
     checkTold(told, 2);
     CHECK(failed >= 2); // the lost rank may not even begin the frame
@@ -240,124 +244,143 @@ TEST_CASE("A frame that is open while rendering fails when a rank is lost, and s
 TEST_CASE("The handler is called where a rank was found lost, once, and not on the others", "[lost_peers]")
 {
     constexpr int ranks = 5, victim = 4; // only rank 0 listens for the victim
-    const auto holds = std::make_shared<Holds>(ranks);
-    std::vector<std::atomic<int>> calls(ranks);
-    std::atomic<int> lost{-1}, over{0};
-    std::vector<std::string> texts(ranks);
-    runOn(
-        std::make_shared<Board>(), ranks,
-        [&](const BoardTransport::Communicator& communicator) {
-            const auto rank = static_cast<std::size_t>(communicator.inner.rank());
-            auto options = timedOptions();
-            options.onPeerLost = [&, rank](const dfb::ErrorInfo& error) {
-                ++calls[rank];
-                lost = error.rank;
-            };
-            FrameBuffer fb({communicator, holds}, smallConfig(), options);
-            emptyFrame(fb);
-            if (fb.rank() == victim) {
-                holds->held[victim] = true;
-                while (over < ranks - 1)
-                    std::this_thread::sleep_for(milliseconds(1));
-                holds->held[victim] = false;
-            }
-            texts[rank] = outcomeOf([&] { emptyFrame(fb); });
-            ++over;
-        },
-        seed);
-    INFO(joined(texts));
-    CHECK(lost == victim);
-    CHECK(calls[0] == 1);
+    struct Outcome {
+        std::vector<int> calls = std::vector<int>(ranks);
+        int lost = -1;
+        std::vector<std::string> texts = std::vector<std::string>(ranks);
+    };
+    const Outcome o = undisturbed([&] {
+        const auto holds = std::make_shared<Holds>(ranks);
+        std::vector<std::atomic<int>> calls(ranks);
+        std::atomic<int> lost{-1}, over{0};
+        Outcome outcome;
+        runOn(
+            std::make_shared<Board>(), ranks,
+            [&](const BoardTransport::Communicator& communicator) {
+                const auto rank = static_cast<std::size_t>(communicator.inner.rank());
+                auto options = timedOptions();
+                options.onPeerLost = [&, rank](const dfb::ErrorInfo& error) {
+                    ++calls[rank];
+                    lost = error.rank;
+                };
+                FrameBuffer fb({communicator, holds}, smallConfig(), options);
+                emptyFrame(fb);
+                if (fb.rank() == victim) {
+                    holds->held[victim] = true;
+                    while (over < ranks - 1)
+                        std::this_thread::sleep_for(milliseconds(1));
+                    holds->held[victim] = false;
+                }
+                outcome.texts[rank] = outcomeOf([&] { emptyFrame(fb); });
+                ++over;
+            },
+            seed);
+        std::copy(calls.begin(), calls.end(), outcome.calls.begin());
+        outcome.lost = lost;
+        return outcome;
+    });
+    INFO(joined(o.texts));
+    CHECK(o.lost == victim);
+    CHECK(o.calls[0] == 1);
     for (std::size_t rank = 1; rank < ranks; ++rank)
-        CHECK(calls[rank] == 0);
-    for (const std::string& text : texts)
+        CHECK(o.calls[rank] == 0);
+    for (const std::string& text : o.texts)
         CHECK(has(text, "rank 4"));
 }
 
 TEST_CASE("A rank that renders long, or polls slowly, raises no alarm", "[lost_peers]")
 {
-    const auto holds = std::make_shared<Holds>(3);
-    std::vector<std::string> texts(3);
-    runOn(
-        std::make_shared<Board>(), 3,
-        [&](const BoardTransport::Communicator& communicator) {
-            FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions());
-            emptyFrame(fb);
-            const auto rank = static_cast<std::size_t>(fb.rank());
-            if (rank == 2)
-                holds->slowMs[rank] = 20; // the others take about 1 ms
-            texts[rank] = outcomeOf([&] {
-                auto frame = begin(fb);
+    const auto all = undisturbed([&] {
+        const auto holds = std::make_shared<Holds>(3);
+        std::vector<std::string> texts(3);
+        runOn(
+            std::make_shared<Board>(), 3,
+            [&](const BoardTransport::Communicator& communicator) {
+                FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions());
+                emptyFrame(fb);
+                const auto rank = static_cast<std::size_t>(fb.rank());
                 if (rank == 2)
-                    std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
-                frame.end();
-                if (rank == 1) // and between frames, with the others in a call that waits for all
-                    std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
-                fb.allReduce({1}, FrameBuffer::Reduce::Sum);
-            });
-            holds->slowMs[rank] = 0;
-        },
-        seed);
-    INFO(joined(texts));
-    for (const std::string& text : texts)
+                    holds->slowMs[rank] = 20; // the others take about 1 ms
+                texts[rank] = outcomeOf([&] {
+                    auto frame = begin(fb);
+                    if (rank == 2)
+                        std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
+                    frame.end();
+                    if (rank == 1) // and between frames, with the others in a call that waits for all
+                        std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
+                    fb.allReduce({1}, FrameBuffer::Reduce::Sum);
+                });
+                holds->slowMs[rank] = 0;
+            },
+            seed);
+        return texts;
+    });
+    INFO(joined(all));
+    for (const std::string& text : all)
         CHECK(text == "fine");
 }
 
 TEST_CASE("A rank that was held itself does not take the others for lost", "[lost_peers]")
 {
-    const auto holds = std::make_shared<Holds>(3);
-    std::vector<std::string> texts(3);
-    runOn(
-        std::make_shared<Board>(), 3,
-        [&](const BoardTransport::Communicator& communicator) {
-            const bool isHeld = communicator.inner.rank() == 1;
-            FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(isHeld ? timeoutMs : 60000));
-            emptyFrame(fb);
-            const auto rank = static_cast<std::size_t>(fb.rank());
-            texts[rank] = outcomeOf([&] {
-                auto frame = begin(fb);
-                if (isHeld) {
-                    std::this_thread::sleep_for(milliseconds(timeoutMs / 2));
-                    holds->held[rank] = true;
-                    std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
-                    holds->held[rank] = false;
-                    std::this_thread::sleep_for(milliseconds(timeoutMs));
-                }
-                frame.end();
-            });
-        },
-        seed);
-    INFO(joined(texts));
-    for (const std::string& text : texts)
+    const auto all = undisturbed([&] {
+        const auto holds = std::make_shared<Holds>(3);
+        std::vector<std::string> texts(3);
+        runOn(
+            std::make_shared<Board>(), 3,
+            [&](const BoardTransport::Communicator& communicator) {
+                const bool isHeld = communicator.inner.rank() == 1;
+                FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(isHeld ? timeoutMs : 60000));
+                emptyFrame(fb);
+                const auto rank = static_cast<std::size_t>(fb.rank());
+                texts[rank] = outcomeOf([&] {
+                    auto frame = begin(fb);
+                    if (isHeld) {
+                        std::this_thread::sleep_for(milliseconds(timeoutMs / 2));
+                        holds->held[rank] = true;
+                        std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
+                        holds->held[rank] = false;
+                        std::this_thread::sleep_for(milliseconds(timeoutMs));
+                    }
+                    frame.end();
+                });
+            },
+            seed);
+        return texts;
+    });
+    INFO(joined(all));
+    for (const std::string& text : all)
         CHECK(text == "fine");
 }
 
 TEST_CASE("Ranks without a progress thread, or without a time-out, are not taken for lost", "[lost_peers]")
 {
     for (const bool byCaller : {true, false}) {
-        const auto holds = std::make_shared<Holds>(2);
-        std::vector<std::string> texts(2);
-        runOn(
-            std::make_shared<Board>(), 2,
-            [&](const BoardTransport::Communicator& communicator) {
-                const bool isOther = communicator.inner.rank() == 1;
-                auto options = timedOptions(isOther && !byCaller ? 0 : timeoutMs);
-                if (isOther && byCaller)
-                    options.progress = dfb::Progress::Caller;
-                FrameBuffer fb({communicator, holds}, smallConfig(), options);
-                const auto rank = static_cast<std::size_t>(fb.rank());
-                texts[rank] = outcomeOf([&] {
-                    auto frame = begin(fb);
-                    holds->held[1] = isOther && !byCaller;
-                    if (isOther)
-                        std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
-                    holds->held[1] = false;
-                    frame.end();
-                });
-            },
-            seed);
-        INFO(joined(texts));
-        for (const std::string& text : texts)
+        const auto all = undisturbed([&] {
+            const auto holds = std::make_shared<Holds>(2);
+            std::vector<std::string> texts(2);
+            runOn(
+                std::make_shared<Board>(), 2,
+                [&](const BoardTransport::Communicator& communicator) {
+                    const bool isOther = communicator.inner.rank() == 1;
+                    auto options = timedOptions(isOther && !byCaller ? 0 : timeoutMs);
+                    if (isOther && byCaller)
+                        options.progress = dfb::Progress::Caller;
+                    FrameBuffer fb({communicator, holds}, smallConfig(), options);
+                    const auto rank = static_cast<std::size_t>(fb.rank());
+                    texts[rank] = outcomeOf([&] {
+                        auto frame = begin(fb);
+                        holds->held[1] = isOther && !byCaller;
+                        if (isOther)
+                            std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
+                        holds->held[1] = false;
+                        frame.end();
+                    });
+                },
+                seed);
+            return texts;
+        });
+        INFO(joined(all));
+        for (const std::string& text : all)
             CHECK(text == "fine");
     }
 }
@@ -365,80 +388,87 @@ TEST_CASE("Ranks without a progress thread, or without a time-out, are not taken
 TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few messages are sent", "[lost_peers]")
 {
     constexpr int ranks = 4, quietMs = 2 * timeoutMs;
+    constexpr int pairs = ranks - 1; // pairs of neighbours in the tree
+    struct Counts {
+        int atStart, idle, silent, napsIdle;
+        double idleMs, silentMs; // as long as it took
+    };
     for (const int peerTimeoutMs : {0, timeoutMs}) {
-        const auto holds = std::make_shared<Holds>(ranks);
-        const auto board = std::make_shared<Board>();
-        std::atomic<int> signs{0}, others{0};
-        board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer&) {
-            ++(isSign(header) ? signs : others);
-            return Board::What::Pass;
-        };
-        const int pairs = ranks - 1; // pairs of neighbours in the tree
         const int expected = peerTimeoutMs > 0 ? 2 * pairs : 0;
-        std::atomic<int> out{0}, atStart{0}, idle{0}, silent{0}, napsIdle{0}, napsBefore{0}, begun{0};
-        std::atomic<double> idleMs{0}, silentMs{0}; // as long as it took
-        const auto msSince = [](Clock::time_point start) {
-            return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
-        };
-        const auto waitFor = [](const auto& condition) {
-            for (const auto end = Clock::now() + std::chrono::seconds(20); !condition() && Clock::now() < end;)
-                std::this_thread::sleep_for(milliseconds(1));
-        };
-        const auto allNaps = [&] {
-            int sum = 0;
-            for (const auto& n : holds->naps)
-                sum += n;
-            return sum;
-        };
-        runOn(
-            board, ranks,
-            [&](const BoardTransport::Communicator& communicator) {
-                FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(peerTimeoutMs));
-                emptyFrame(fb);
-                ++out;
-                if (fb.rank() == 0) {
-                    waitFor([&] { return out == ranks && signs >= expected; });
-                    std::this_thread::sleep_for(milliseconds(300)); // until all are asleep
-                    atStart = signs.load();
-                    napsBefore = allNaps();
-                    const auto start = Clock::now();
-                    std::this_thread::sleep_for(milliseconds(quietMs));
-                    idle = signs - atStart;
-                    napsIdle = allNaps() - napsBefore;
-                    idleMs = msSince(start);
+        const Counts c = undisturbed([&] {
+            const auto holds = std::make_shared<Holds>(ranks);
+            const auto board = std::make_shared<Board>();
+            std::atomic<int> signs{0}, others{0};
+            board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer&) {
+                ++(isSign(header) ? signs : others);
+                return Board::What::Pass;
+            };
+            std::atomic<int> out{0}, atStart{0}, idle{0}, silent{0}, napsIdle{0}, napsBefore{0}, begun{0};
+            std::atomic<double> idleMs{0}, silentMs{0};
+            const auto msSince = [](Clock::time_point start) {
+                return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
+            };
+            const auto waitFor = [](const auto& condition) {
+                for (const auto end = Clock::now() + std::chrono::seconds(20); !condition() && Clock::now() < end;)
+                    std::this_thread::sleep_for(milliseconds(1));
+            };
+            const auto allNaps = [&] {
+                int sum = 0;
+                for (const auto& n : holds->naps)
+                    sum += n;
+                return sum;
+            };
+            runOn(
+                board, ranks,
+                [&](const BoardTransport::Communicator& communicator) {
+                    FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(peerTimeoutMs));
+                    emptyFrame(fb);
                     ++out;
-                }
-                waitFor([&] { return out > ranks; });
-                auto frame = begin(fb);
-                ++begun;
-                if (fb.rank() == 0) {
-                    waitFor([&] { return begun == ranks; });
-                    const auto start = Clock::now();
-                    const int before = signs;
-                    std::this_thread::sleep_for(milliseconds(quietMs));
-                    waitFor([&] { return peerTimeoutMs == 0 || signs > before; });
-                    silent = signs - before;
-                    silentMs = msSince(start);
+                    if (fb.rank() == 0) {
+                        waitFor([&] { return out == ranks && signs >= expected; });
+                        std::this_thread::sleep_for(milliseconds(300)); // until all are asleep
+                        atStart = signs.load();
+                        napsBefore = allNaps();
+                        const auto start = Clock::now();
+                        std::this_thread::sleep_for(milliseconds(quietMs));
+                        idle = signs - atStart;
+                        napsIdle = allNaps() - napsBefore;
+                        idleMs = msSince(start);
+                        ++out;
+                    }
+                    waitFor([&] { return out > ranks; });
+                    auto frame = begin(fb);
                     ++begun;
-                }
-                waitFor([&] { return begun > ranks; });
-                frame.end();
-            },
-            seed);
-        INFO("time-out " << peerTimeoutMs << ": " << atStart << " signs of life at the start, " << idle << " idle, "
-                         << silent << " in a frame of " << silentMs << " ms; " << napsIdle << " naps in " << idleMs
-                         << " ms");
-        CHECK(atStart == expected);
-        CHECK(idle == 0);
+                    if (fb.rank() == 0) {
+                        waitFor([&] { return begun == ranks; });
+                        const auto start = Clock::now();
+                        const int before = signs;
+                        std::this_thread::sleep_for(milliseconds(quietMs));
+                        waitFor([&] { return peerTimeoutMs == 0 || signs > before; });
+                        silent = signs - before;
+                        silentMs = msSince(start);
+                        ++begun;
+                    }
+                    waitFor([&] { return begun > ranks; });
+                    frame.end();
+                },
+                seed);
+            return Counts{atStart, idle, silent, napsIdle, idleMs, silentMs};
+        });
+        INFO("time-out " << peerTimeoutMs << ": " << c.atStart << " signs of life at the start, " << c.idle << " idle, "
+                         << c.silent << " in a frame of " << c.silentMs << " ms; " << c.napsIdle << " naps in "
+                         << c.idleMs << " ms");
+        CHECK(c.atStart == expected);
+        CHECK(c.idle == 0);
         if (peerTimeoutMs == 0) {
-            CHECK(silent == 0);
+            CHECK(c.silent == 0);
         } else {
-            CHECK(silent > 0);
+            CHECK(c.silent > 0);
             // At most a question and an answer in each direction, for each quarter of the time-out.
-            CHECK(silent <= pairs * 4 * 4 * (silentMs / timeoutMs + 1));
+            CHECK(c.silent <= pairs * 4 * 4 * (c.silentMs / timeoutMs + 1));
         }
         // Idle threads wake up once a second, or once in a quarter of the time-out if that is shorter.
-        CHECK(napsIdle <= ranks * (idleMs / (peerTimeoutMs > 0 ? timeoutMs / 4 : 1000) + 2));
+        CHECK(c.napsIdle <= ranks * (c.idleMs / (peerTimeoutMs > 0 ? timeoutMs / 4 : 1000) + 2));
     }
 }
 

@@ -487,8 +487,10 @@ TEST_CASE("With checksums a changed byte anywhere is an error, never a wrong ima
         for (const int place : {0, 2, 3, 4, 8, 16, 20, 24, -1})
             if (target.kind != MessageKind::ManifestAck || place != 24) // it has no body
                 cases.push_back({target, place});
-    constexpr int limitMs = 2000; // for a lost verdict; enough for all else, even if busy
-    const auto runCase = [](const Case& c) { return damagedFrame(c.target.kind, c.target.scope, c.place, limitMs); };
+    const auto runCase = [](const Case& c) {
+        const int limitMs = c.target.scope == FrameVerdict ? 2000 : 20000; // only a lost verdict is waited for
+        return damagedFrame(c.target.kind, c.target.scope, c.place, limitMs);
+    };
     board::eachAtOnce(cases, runCase, [](const Case& c, const Damaged& d) {
         INFO(c.target.name << ", byte " << c.place << joined(d.texts) << "\n after it" << joined(d.after));
         CHECK(d.before == std::vector<std::string>(2, "fine"));
@@ -536,40 +538,48 @@ TEST_CASE("A damaged vote or verdict does not hang a frame that has no time-out"
 TEST_CASE("A damaged vote does not keep a frame open that is ended by tryEnd()", "[messaging]")
 {
     enum : std::uint32_t { FrameVerdict = 2 };
-    const auto board = std::make_shared<Board>();
-    std::atomic<bool> done{false};
-    board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
-        if (header.kind == MessageKind::ReduceUp
-            && dfb::detail::loadAs<std::uint32_t>(message.data() + sizeof header) == FrameVerdict
-            && !done.exchange(true))
-            message.data()[message.size() - 1] ^= std::byte{0x24};
-        return Board::What::Pass;
+    struct Outcome {
+        bool done = false;
+        std::vector<std::string> texts = std::vector<std::string>(2);
     };
-    std::vector<std::string> texts(2);
-    runOn(board, 2, [&](const auto& communicator) {
-        dfb::NetworkConfig options;
-        options.checksums = true;
-        options.peerTimeout = std::chrono::milliseconds(peerMs);
-        FrameBuffer<Blend> fb(communicator, configOf(sceneFor(Loop::Declared)), options);
-        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
-            dfb::FrameConfig params;
-            params.declared = true;
-            auto frame = fb.begin(params);
-            frame.declare({});
-            const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(20);
-            while (!frame.tryEnd()) {
-                if (std::chrono::steady_clock::now() > limit)
-                    throw std::runtime_error("the frame is still open");
-                std::this_thread::sleep_for(std::chrono::milliseconds(1));
-            }
+    const Outcome o = undisturbed([] {
+        const auto board = std::make_shared<Board>();
+        std::atomic<bool> done{false};
+        board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
+            if (header.kind == MessageKind::ReduceUp
+                && dfb::detail::loadAs<std::uint32_t>(message.data() + sizeof header) == FrameVerdict
+                && !done.exchange(true))
+                message.data()[message.size() - 1] ^= std::byte{0x24};
+            return Board::What::Pass;
+        };
+        Outcome outcome;
+        runOn(board, 2, [&](const auto& communicator) {
+            dfb::NetworkConfig options;
+            options.checksums = true;
+            options.peerTimeout = std::chrono::milliseconds(peerMs);
+            FrameBuffer<Blend> fb(communicator, configOf(sceneFor(Loop::Declared)), options);
+            outcome.texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+                dfb::FrameConfig params;
+                params.declared = true;
+                auto frame = fb.begin(params);
+                frame.declare({});
+                const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(20);
+                while (!frame.tryEnd()) {
+                    if (std::chrono::steady_clock::now() > limit)
+                        throw std::runtime_error("the frame is still open");
+                    std::this_thread::sleep_for(std::chrono::milliseconds(1));
+                }
+            });
         });
+        outcome.done = done;
+        return outcome;
     });
-    INFO(joined(texts));
-    CHECK(done);
-    CHECK(std::any_of(texts.begin(), texts.end(), [](const std::string& text) {
+    INFO(joined(o.texts));
+    CHECK(o.done);
+    CHECK(std::any_of(o.texts.begin(), o.texts.end(), [](const std::string& text) {
         return has(text, "not all ranks have ended this frame after " + std::to_string(peerMs) + " ms");
     }));
-    for (const std::string& text : texts)
+    for (const std::string& text : o.texts)
         CHECK(has(text, "TransportError"));
 }
 
@@ -614,39 +624,42 @@ TEST_CASE("With frames in flight a damaged message costs frames, not the framebu
 TEST_CASE("A damaged part of a reduction that its receiver is not at yet ends in an error on every rank", "[messaging]")
 {
     const Scene s = sceneFor(Loop::Declared);
-    const auto board = std::make_shared<Board>();
-    std::atomic<bool> armed{false}, done{false};
-    std::promise<void> came;
-    board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
-        if (armed && header.kind == MessageKind::ReduceUp && !done.exchange(true))
-            message.data()[message.size() - 1] ^= std::byte{1};
-        return Board::What::Pass;
-    };
-    board->passed = [&](int, int, const MessageHeader& header) {
-        if (header.kind == MessageKind::ReduceUp && armed.exchange(false))
-            came.set_value();
-    };
-    std::vector<std::string> texts(2);
-    runOn(board, 2, [&](const auto& communicator) {
-        auto config = configOf(s);
-        config.executor = std::make_shared<dfb::CallerExecutor>(); // its tasks run in poll()
-        dfb::NetworkConfig options;
-        options.checksums = true;
-        options.peerTimeout = std::chrono::milliseconds(peerMs);
-        FrameBuffer<Blend> fb(communicator, config, options);
-        scene::renderLoop(fb, s, Loop::Declared);
-        if (fb.rank() == 1) {
-            armed = true;
-        } else {
-            came.get_future().wait_for(std::chrono::seconds(20));
-            while (fb.poll()) {
+    const auto all = undisturbed([&] {
+        const auto board = std::make_shared<Board>();
+        std::atomic<bool> armed{false}, done{false};
+        std::promise<void> came;
+        board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
+            if (armed && header.kind == MessageKind::ReduceUp && !done.exchange(true))
+                message.data()[message.size() - 1] ^= std::byte{1};
+            return Board::What::Pass;
+        };
+        board->passed = [&](int, int, const MessageHeader& header) {
+            if (header.kind == MessageKind::ReduceUp && armed.exchange(false))
+                came.set_value();
+        };
+        std::vector<std::string> texts(2);
+        runOn(board, 2, [&](const auto& communicator) {
+            auto config = configOf(s);
+            config.executor = std::make_shared<dfb::CallerExecutor>(); // its tasks run in poll()
+            dfb::NetworkConfig options;
+            options.checksums = true;
+            options.peerTimeout = std::chrono::milliseconds(peerMs);
+            FrameBuffer<Blend> fb(communicator, config, options);
+            scene::renderLoop(fb, s, Loop::Declared);
+            if (fb.rank() == 1) {
+                armed = true;
+            } else {
+                came.get_future().wait_for(std::chrono::seconds(20));
+                while (fb.poll()) {
+                }
             }
-        }
-        texts[static_cast<std::size_t>(fb.rank())] =
-            outcomeOf([&] { fb.allReduce({7}, FrameBuffer<Blend>::Reduce::Sum); });
+            texts[static_cast<std::size_t>(fb.rank())] =
+                outcomeOf([&] { fb.allReduce({7}, FrameBuffer<Blend>::Reduce::Sum); });
+        });
+        return texts;
     });
-    INFO(joined(texts));
-    for (const std::string& text : texts) {
+    INFO(joined(all));
+    for (const std::string& text : all) {
         CHECK(has(text, "TransportError: dfb: malformed message"));
         CHECK(has(text, "in a message from rank 1"));
     }
