@@ -29,8 +29,8 @@ public:
 
     // The time in a phase, in ms, without what has passed since the last enter().
     double ms(Phase phase) const { return ms_[static_cast<std::size_t>(phase)]; }
-    // The time from the beginning to now, in ms.
-    double totalMs() const { return Milliseconds(Clock::now() - begin_).count(); }
+    // The time of all phases, in ms: from the beginning to the last enter().
+    double totalMs() const { return Milliseconds(since_ - begin_).count(); }
 
 private:
     using Milliseconds = std::chrono::duration<double, std::milli>;
