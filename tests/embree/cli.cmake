@@ -26,7 +26,7 @@ if(TARGET dfb::mpi AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
   add_executable(dfb_render_stopped $<TARGET_OBJECTS:dfb_render> embree/tools/stop_rank.cpp)
   target_link_libraries(dfb_render_stopped PRIVATE dfb_developer dfb_embree_example dfb_live)
   dfb_add_mpi_run(render.peer_timeout RANKS 2 LABELS example WAITS
-    COMMAND $<TARGET_FILE:dfb_render_stopped> demo --size 64x64 --frames 1000000 --peer-timeout 1)
+    COMMAND $<TARGET_FILE:dfb_render_stopped> demo --size 64x64 --frames 1000000 --peer-timeout 5)
   set_tests_properties(render.peer_timeout.np2 PROPERTIES
     PASS_REGULAR_EXPRESSION "dfb: transport failure: rank 1: this rank is lost")
 endif()

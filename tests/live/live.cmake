@@ -25,11 +25,11 @@ endif()
 add_executable(dfb_live_job live/job.cpp)
 target_link_libraries(dfb_live_job PRIVATE dfb_developer_flags PkgConfig::DFB_HTTPLIB nlohmann_json::nlohmann_json)
 set(_mpi ${MPIEXEC_EXECUTABLE} ${_mpiexec_flags} ${MPIEXEC_PREFLAGS} ${MPIEXEC_NUMPROC_FLAG})
-dfb_limit(_limit 60)
+dfb_limit(_limit 240)
 # _add_live_job(<name> <case> <command>...)
 function(_add_live_job name case)
   add_test(NAME live.job.${name} COMMAND ${_limit} $<TARGET_FILE:dfb_live_job> ${case} ${ARGN})
-  set_tests_properties(live.job.${name} PROPERTIES LABELS example TIMEOUT 80)
+  set_tests_properties(live.job.${name} PROPERTIES LABELS example TIMEOUT 260)
 endfunction()
 set(_render $<TARGET_FILE:dfb_render> ${MPIEXEC_POSTFLAGS} demo --size 160x120)
 _add_live_job(button.data.np3 button ${_mpi} 3 ${_render} --live 0)
@@ -45,7 +45,7 @@ set_tests_properties(live.job.rest.np2 PROPERTIES ${_undisturbed}) # it measures
 _add_live_job(fire.np2 fire ${_mpi} 2 ${_render} --live 0)
 add_test(NAME live.taken COMMAND ${_limit} $<TARGET_FILE:dfb_live_job> taken $<TARGET_FILE:dfb_render> demo --size 16x16
   --ranks 1 --live 0)
-set_tests_properties(live.taken PROPERTIES LABELS example TIMEOUT 80)
+set_tests_properties(live.taken PROPERTIES LABELS example TIMEOUT 260)
 
 # The page in a browser: see browser.sh, which installs what it needs.
 set(DFB_LIVE_NODE_MODULES "$ENV{DFB_LIVE_NODE_MODULES}" CACHE PATH "Folder that has puppeteer-core, for the test of the page")

@@ -525,7 +525,7 @@ TEST_CASE("viewers that are dead or slow take nothing from the job and the other
         Clock::duration picture{}, answer{};
     };
     int shown = 1;
-    const Slowest slowest = undisturbed([&] {
+    const auto showAll = [&] {
         Slowest times;
         for (int i = 0; i < 50; ++i) {
             const auto begin = Clock::now();
@@ -535,9 +535,14 @@ TEST_CASE("viewers that are dead or slow take nothing from the job and the other
             times.answer = std::max(times.answer, Clock::now() - begin);
         }
         return times;
-    });
-    CHECK(slowest.picture < milliseconds(500)); // a copy of 250 kB
-    CHECK(slowest.answer < milliseconds(1500));
+    };
+    constexpr milliseconds pictureLimit(500), answerLimit(1500); // the job copies 250 kB
+    const auto isSlow = [&](bool, const auto& times) {           // on a busy machine, but not each time
+        return times.get().picture >= pictureLimit || times.get().answer >= answerLimit;
+    };
+    const Slowest slowest = undisturbed(showAll, isSlow);
+    CHECK(slowest.picture < pictureLimit);
+    CHECK(slowest.answer < answerLimit);
     // Nor does the job keep them: of the picture that nobody reads only what the system has room for is sent.
     for (std::size_t i = 1; i < dead.size(); i += 3) {
         pollfd picture{dead[i]->fd(), POLLIN, 0};
@@ -546,7 +551,7 @@ TEST_CASE("viewers that are dead or slow take nothing from the job and the other
     const auto begun = Clock::now(); // on a busy machine long after they have asked
     for (std::size_t i = 0; i < dead.size(); ++i) {
         if (i % 3 == 1) {
-            std::this_thread::sleep_until(begun + seconds(7)); // it is this time that it must not wait for
+            std::this_thread::sleep_until(begun + seconds(10)); // it is this time that it must not wait for
             CHECK(dead[i]->receiveAll().size() < std::size_t{8} << 20);
         } else {
             pollfd end{dead[i]->fd(), POLLRDHUP, 0};
