@@ -16,6 +16,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 #include <unistd.h>
 
 static int rank = 0, ranks = 1, failures = 0;
@@ -487,6 +488,19 @@ static int draw_and_stop(const dfb_brick* brick, const dfb_tile* tile, void* use
     return draw(brick, tile, NULL);
 }
 
+/* Continues a process until its rank has sent a message, as it may not have stopped yet. */
+static void wake(int from, pid_t process)
+{
+    const struct timespec pause = {0, 10000000};
+    int is_there = 0, message = 0;
+    while (!is_there) {
+        kill(process, SIGCONT);
+        nanosleep(&pause, NULL);
+        MPI_Iprobe(from, 0, MPI_COMM_WORLD, &is_there, MPI_STATUS_IGNORE);
+    }
+    MPI_Recv(&message, 1, MPI_INT, from, 0, MPI_COMM_WORLD, MPI_STATUS_IGNORE);
+}
+
 /* The last rank is stopped, as by a batch system, and says nothing then. */
 static void check_lost(void)
 {
@@ -514,8 +528,10 @@ static void check_lost(void)
     expect(dfb_render(fb, bricks, 2, scene_view, scene_projection, draw, NULL) == DFB_TRANSPORT_FAILED, "no other one");
     dfb_destroy(fb); /* which waits for nobody */
     MPI_Barrier(others);
+    if (rank == lost)
+        MPI_Send(&pid, 1, MPI_INT, 0, 0, MPI_COMM_WORLD);
     if (rank == 0)
-        kill((pid_t)pid, SIGCONT);
+        wake(lost, (pid_t)pid);
     MPI_Comm_free(&others);
 }
 

@@ -404,8 +404,16 @@ void tryLoss(int signal, int launched)
         }
         pause(); // until the launcher ends the job
     }
-    if (rank == 0)
-        kill(process, SIGCONT);
+    if (rank == victim)
+        MPI_Send(&process, 1, MPI_INT, 0, 0, MPI_COMM_WORLD);
+    if (rank == 0) { // again and again until the rank answers, as it may not have stopped yet
+        for (int isThere = 0; !isThere;) {
+            kill(process, SIGCONT);
+            usleep(10000);
+            MPI_Iprobe(victim, 0, MPI_COMM_WORLD, &isThere, MPI_STATUS_IGNORE);
+        }
+        MPI_Recv(&process, 1, MPI_INT, victim, 0, MPI_COMM_WORLD, MPI_STATUS_IGNORE);
+    }
     expect(icetImageIsNull(Picture(40, 30).composite()), "a picture in a context that has failed");
     expectError(ICET_INVALID_OPERATION, "a context that has failed");
     icetDestroyContext(context);
