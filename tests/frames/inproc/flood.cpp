@@ -505,7 +505,7 @@ TEST_CASE("Who has voted on a partial frame that was cancelled sends no more inp
             frame.setTile(*tile);
         }
         if (fb.rank() == 2) {
-            noCreditLeft.get_future().wait_for(std::chrono::seconds(5));
+            noCreditLeft.get_future().wait_for(std::chrono::seconds(20));
             frame.cancel();
         }
         texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { frame.end(); });

@@ -258,27 +258,24 @@ TEST_CASE("Ranks with different pools make no wall", "[wall]")
 TEST_CASE("Who ends a frame on a wall that another rank has left does not wait for that one", "[wall]")
 {
     std::vector<std::string> texts(2);
-    board::runOn(
-        std::make_shared<Board>(), 2,
-        [&](const BoardTransport::Communicator& communicator) {
-            const auto connection = dfb::connect<BoardTransport>(communicator);
-            auto wall = std::make_unique<dfb::DisplayWall>(connection, dfb::WallLayout{2, 1, 64, 64, 0, 0, {0, 1}},
-                                                           dfb::OutputFormat::RGBA8);
-            auto fb = std::make_unique<FrameBuffer>(connection, wall->frameBufferConfig(), dfb::ToWall{wall.get()});
-            const auto rank = static_cast<std::size_t>(fb->rank());
-            texts[rank] = outcomeOf([&] {
-                auto frame = fb->begin();
-                frame.cancel();
-                frame.end();
-            });
-            if (rank == 1) {
-                fb.reset();
-                wall.reset();
-            } else {
-                texts[rank] = outcomeOf([&] { wall->finish(1); });
-            }
-        },
-        std::nullopt, std::chrono::seconds(5));
+    board::runOn(std::make_shared<Board>(), 2, [&](const BoardTransport::Communicator& communicator) {
+        const auto connection = dfb::connect<BoardTransport>(communicator);
+        auto wall = std::make_unique<dfb::DisplayWall>(connection, dfb::WallLayout{2, 1, 64, 64, 0, 0, {0, 1}},
+                                                       dfb::OutputFormat::RGBA8);
+        auto fb = std::make_unique<FrameBuffer>(connection, wall->frameBufferConfig(), dfb::ToWall{wall.get()});
+        const auto rank = static_cast<std::size_t>(fb->rank());
+        texts[rank] = outcomeOf([&] {
+            auto frame = fb->begin();
+            frame.cancel();
+            frame.end();
+        });
+        if (rank == 1) {
+            fb.reset();
+            wall.reset();
+        } else {
+            texts[rank] = outcomeOf([&] { wall->finish(1); });
+        }
+    });
     INFO(joined(texts));
     CHECK(has(texts[1], "FrameError"));
     CHECK((has(texts[0], "TransportError") && has(texts[0], "rank 1") && has(texts[0], "destroyed")));
