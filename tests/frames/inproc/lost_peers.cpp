@@ -288,29 +288,20 @@ TEST_CASE("The handler is called where a rank was found lost, once, and not on t
         CHECK(has(text, "rank 4"));
 }
 
-TEST_CASE("A rank that renders long, or polls slowly, raises no alarm", "[lost_peers]")
+namespace {
+
+// Calls run(communicator, holds) on each rank, and checks that it is fine.
+template <class Run>
+void checkFine(int ranks, const Run& run)
 {
     const auto all = undisturbed([&] {
-        const auto holds = std::make_shared<Holds>(3);
-        std::vector<std::string> texts(3);
+        const auto holds = std::make_shared<Holds>(ranks);
+        std::vector<std::string> texts(static_cast<std::size_t>(ranks));
         runOn(
-            std::make_shared<Board>(), 3,
+            std::make_shared<Board>(), ranks,
             [&](const BoardTransport::Communicator& communicator) {
-                FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions());
-                emptyFrame(fb);
-                const auto rank = static_cast<std::size_t>(fb.rank());
-                if (rank == 2)
-                    holds->slowMs[rank] = 20; // the others take about 1 ms
-                texts[rank] = outcomeOf([&] {
-                    auto frame = begin(fb);
-                    if (rank == 2)
-                        std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
-                    frame.end();
-                    if (rank == 1) // and between frames, with the others in a call that waits for all
-                        std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
-                    fb.allReduce({1}, FrameBuffer::Reduce::Sum);
-                });
-                holds->slowMs[rank] = 0;
+                texts[static_cast<std::size_t>(communicator.inner.rank())] =
+                    outcomeOf([&] { run(communicator, holds); });
             },
             seed);
         return texts;
@@ -318,71 +309,63 @@ TEST_CASE("A rank that renders long, or polls slowly, raises no alarm", "[lost_p
     INFO(joined(all));
     for (const std::string& text : all)
         CHECK(text == "fine");
+}
+
+} // namespace
+
+TEST_CASE("A rank that renders long, or polls slowly, raises no alarm", "[lost_peers]")
+{
+    checkFine(3, [](const BoardTransport::Communicator& communicator, const std::shared_ptr<Holds>& holds) {
+        FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions());
+        emptyFrame(fb);
+        const auto rank = static_cast<std::size_t>(fb.rank());
+        if (rank == 2)
+            holds->slowMs[rank] = 20; // the others take about 1 ms
+        auto frame = begin(fb);
+        if (rank == 2)
+            std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
+        frame.end();
+        if (rank == 1) // and between frames, with the others in a call that waits for all
+            std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
+        fb.allReduce({1}, FrameBuffer::Reduce::Sum);
+        holds->slowMs[rank] = 0;
+    });
 }
 
 TEST_CASE("A rank that was held itself does not take the others for lost", "[lost_peers]")
 {
-    const auto all = undisturbed([&] {
-        const auto holds = std::make_shared<Holds>(3);
-        std::vector<std::string> texts(3);
-        runOn(
-            std::make_shared<Board>(), 3,
-            [&](const BoardTransport::Communicator& communicator) {
-                const bool isHeld = communicator.inner.rank() == 1;
-                FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(isHeld ? timeoutMs : 60000));
-                emptyFrame(fb);
-                const auto rank = static_cast<std::size_t>(fb.rank());
-                texts[rank] = outcomeOf([&] {
-                    auto frame = begin(fb);
-                    if (isHeld) {
-                        std::this_thread::sleep_for(milliseconds(timeoutMs / 2));
-                        holds->held[rank] = true;
-                        std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
-                        holds->held[rank] = false;
-                        std::this_thread::sleep_for(milliseconds(timeoutMs));
-                    }
-                    frame.end();
-                });
-            },
-            seed);
-        return texts;
+    checkFine(3, [](const BoardTransport::Communicator& communicator, const std::shared_ptr<Holds>& holds) {
+        const bool isHeld = communicator.inner.rank() == 1;
+        FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(isHeld ? timeoutMs : 60000));
+        emptyFrame(fb);
+        auto frame = begin(fb);
+        if (isHeld) {
+            std::this_thread::sleep_for(milliseconds(timeoutMs / 2));
+            holds->held[1] = true;
+            std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
+            holds->held[1] = false;
+            std::this_thread::sleep_for(milliseconds(timeoutMs));
+        }
+        frame.end();
     });
-    INFO(joined(all));
-    for (const std::string& text : all)
-        CHECK(text == "fine");
 }
 
 TEST_CASE("Ranks without a progress thread, or without a time-out, are not taken for lost", "[lost_peers]")
 {
-    for (const bool byCaller : {true, false}) {
-        const auto all = undisturbed([&] {
-            const auto holds = std::make_shared<Holds>(2);
-            std::vector<std::string> texts(2);
-            runOn(
-                std::make_shared<Board>(), 2,
-                [&](const BoardTransport::Communicator& communicator) {
-                    const bool isOther = communicator.inner.rank() == 1;
-                    auto options = timedOptions(isOther && !byCaller ? 0 : timeoutMs);
-                    if (isOther && byCaller)
-                        options.progress = dfb::Progress::Caller;
-                    FrameBuffer fb({communicator, holds}, smallConfig(), options);
-                    const auto rank = static_cast<std::size_t>(fb.rank());
-                    texts[rank] = outcomeOf([&] {
-                        auto frame = begin(fb);
-                        holds->held[1] = isOther && !byCaller;
-                        if (isOther)
-                            std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
-                        holds->held[1] = false;
-                        frame.end();
-                    });
-                },
-                seed);
-            return texts;
+    for (const bool byCaller : {true, false})
+        checkFine(2, [&](const BoardTransport::Communicator& communicator, const std::shared_ptr<Holds>& holds) {
+            const bool isOther = communicator.inner.rank() == 1;
+            auto options = timedOptions(isOther && !byCaller ? 0 : timeoutMs);
+            if (isOther && byCaller)
+                options.progress = dfb::Progress::Caller;
+            FrameBuffer fb({communicator, holds}, smallConfig(), options);
+            auto frame = begin(fb);
+            holds->held[1] = isOther && !byCaller;
+            if (isOther)
+                std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
+            holds->held[1] = false;
+            frame.end();
         });
-        INFO(joined(all));
-        for (const std::string& text : all)
-            CHECK(text == "fine");
-    }
 }
 
 TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few messages are sent", "[lost_peers]")
