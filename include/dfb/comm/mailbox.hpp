@@ -149,7 +149,7 @@ public:
     template <class Body>
     void sendBody(int destination, MessageKind kind, std::int64_t number, const Body& body)
     {
-        SmallBytes bytes;
+        Bytes bytes;
         bytes.put(body);
         send(destination, kind, number, bytes);
     }
@@ -392,10 +392,10 @@ public:
     template <class Operation>
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, const char* how, Operation operation)
     {
-        SmallBytes mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
+        Bytes mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
         for (const std::int64_t value : values)
             mine.put(value);
-        const Bytes result = reduceParts(std::move(mine), [operation](ByteReader& a, ByteReader& b, SmallBytes& out) {
+        const Bytes result = reduceParts(std::move(mine), [operation](ByteReader& a, ByteReader& b, Bytes& out) {
             while (a.left() > 0) {
                 const auto x = a.get<std::int64_t>(), y = b.get<std::int64_t>();
                 out.put(operation(x, y));
@@ -413,11 +413,11 @@ public:
     // allReduce().
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call)
     {
-        SmallBytes mine = partOf(call); // then, for each rank: its number, the size, the bytes
+        Bytes mine = partOf(call); // then, for each rank: its number, the size, the bytes
         mine.put(static_cast<std::int32_t>(rank()));
         mine.put(static_cast<std::uint64_t>(own.size()));
         mine.append(own.data(), own.data() + own.size());
-        const Bytes all = reduceParts(std::move(mine), [](ByteReader& a, ByteReader& b, SmallBytes& out) {
+        const Bytes all = reduceParts(std::move(mine), [](ByteReader& a, ByteReader& b, Bytes& out) {
             a.copyTo(out);
             b.copyTo(out);
         });
@@ -437,9 +437,9 @@ public:
 private:
     // Begins the part that this rank brings to a call, with its rank and the call's name. In a combined part the lowest
     // of the ranks stands there; or -1 and a text, if the ranks have made different calls.
-    SmallBytes partOf(const std::string& call) const
+    Bytes partOf(const std::string& call) const
     {
-        SmallBytes out;
+        Bytes out;
         out.put(static_cast<std::int32_t>(rank()));
         out.putText(call);
         return out;
@@ -447,7 +447,7 @@ private:
 
     // Reduces the parts that ranks bring to a call. `combine(a, b, out)` combines what follows the call's name in two
     // parts.
-    Bytes reduceParts(SmallBytes&& mine, std::function<void(ByteReader&, ByteReader&, SmallBytes&)> combine)
+    Bytes reduceParts(Bytes&& mine, std::function<void(ByteReader&, ByteReader&, Bytes&)> combine)
     {
         return reduce(std::move(mine), [combine = std::move(combine)](const Bytes& a, const Bytes& b) {
             ByteReader as(a), bs(b);
@@ -455,7 +455,7 @@ private:
             if (rankA < 0 || rankB < 0)
                 return rankA < 0 ? a : b;
             const std::string callA = as.getText(), callB = bs.getText();
-            SmallBytes out;
+            Bytes out;
             if (callA == callB) {
                 out.put(rankA);
                 out.putText(callA);
@@ -668,7 +668,7 @@ private:
 
     void sendReduction(int destination, const ReductionKey& key, bool up, const Bytes& bytes)
     {
-        SmallBytes body;
+        Bytes body;
         body.put(key.scope);
         body.append(bytes.begin(), bytes.end());
         send(destination, up ? MessageKind::ReduceUp : MessageKind::ReduceDown, key.number, body);

@@ -252,7 +252,7 @@ private:
 
     void tellOthers(const ErrorInfo& info)
     {
-        SmallBytes body;
+        Bytes body;
         put(body, info);
         for (int other = 0; other < mailbox_.size(); ++other)
             if (other != mailbox_.rank())
@@ -364,7 +364,7 @@ private:
 
         Bytes bytes() const
         {
-            SmallBytes out;
+            Bytes out;
             out.put(*this);
             return out;
         }

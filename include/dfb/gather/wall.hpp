@@ -71,7 +71,7 @@ public:
         tellSent(frame);
         mailbox_->wait([&] { return isOver(frame); }, deadline);
         const std::optional<ErrorInfo> mine = whatIsMissing(frame);
-        SmallBytes missing; // empty if nothing is missing
+        Bytes missing; // empty if nothing is missing
         if (mine)
             detail::put(missing, *mine);
         const Bytes all = mailbox_->reduce(missing, [](const Bytes& a, const Bytes& b) { return a.empty() ? b : a; });
@@ -363,7 +363,7 @@ private:
             {SentPixels, frame}, Bytes(first, first + mine.size() * sizeof mine[0]),
             [](const Bytes& a, const Bytes& b) { // of equal length, see receiveSent()
                 ByteReader x(a), y(b);
-                SmallBytes sums;
+                Bytes sums;
                 while (x.left() > 0)
                     sums.put(x.get<std::uint64_t>() + y.get<std::uint64_t>());
                 return sums;

@@ -1,5 +1,5 @@
-// The kernels that read inputs and write messages: which pixels are active, copies that check them, and the conversion
-// of colours to the formats in which they travel, and back.
+// The kernels between an input and its message: the conversion of colours to the formats in which they travel, and
+// back; which pixels are active; copies that check them.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -16,11 +16,11 @@
 #include <immintrin.h>
 #endif
 
-// Below: conversion of floats to codes of 16 or 8 bits, rounded to nearest, ties to even, and back, one at a time and
-// in rows. For numbers that have a code, rows give the same bits on every processor; NaNs may differ.
-
 DFB_NAMESPACE_BEGIN
 namespace detail {
+
+// ---- conversion of floats to codes of 16 or 8 bits, rounded to nearest, ties to even, and back: one at a time and in
+// rows. For numbers that have a code, rows give the same bits on every processor; NaNs may differ.
 
 inline float floatOf(std::uint32_t bits) noexcept
 {
@@ -231,6 +231,8 @@ DFB_AVX2 inline bool arePixelsInRangeAvx2(const float* rgba, int count, float ma
 #endif
     return inRange == 0xff && arePixelsInRange(rgba + 4 * i, count - i, maxColor);
 }
+
+// ---- active pixels, and copies that check them
 
 // Returns a bit for each of up to 64 pixels, set if any of its colour channels is not 0.
 DFB_INLINE std::uint64_t findActivePixels(const float* rgba, int count)
