@@ -31,10 +31,10 @@ struct InPlace {
     }
 };
 
-// Makes a renderer for any loop out of pixels that are there already, such as an image that a rank has made by itself.
-// find(view) gets a TileView and points its planes to the pixels of view.region; a view left without colour is empty.
-// Several threads call it at once. Unless it sets staysUntilEnd, the pixels may change when it is called for the next
-// tile on the same thread.
+// Makes a renderer for any loop except DeepParallelLoop out of pixels that are there already, such as an image that a
+// rank has made by itself. find(brick, view), or find(view) for ImageParallelLoop, points the planes of a TileView to
+// the pixels of view.region; a view left without colour is empty. Several threads call it at once. Unless it sets
+// staysUntilEnd, the pixels may change when it is called for the next tile on the same thread.
 template <class Find>
 InPlace<Find> inPlace(Find find)
 {
