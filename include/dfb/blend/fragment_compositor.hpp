@@ -207,8 +207,9 @@ private:
             }
         }
         isFull_ = false;
-        const auto blend =
-            isTold ? detail::blendSparseRowsAvx2<HasLeast, false> : detail::blendSparseRowsAvx2<HasLeast, true>;
+        const auto blend = isTold                        ? detail::blendSparseRowsAvx2<HasLeast>
+                           : layers > detail::rowsAtOnce ? detail::sortSparseRowsAvx2<HasLeast, 16>
+                                                         : detail::sortSparseRowsAvx2<HasLeast, 1>;
         bool isGood = true;
         for (int begin = 0; begin < count; begin += 256)
             detail::forEachRun(blend(rows_.data(), layers, begin, row.minTransmittance, rgba, transmittance, isGood),

@@ -17,6 +17,7 @@ DFB_NAMESPACE_BEGIN
 namespace detail {
 
 inline constexpr int mostInPlace = 32; // the most inputs in place that are blended as they are read
+inline constexpr int rowsAtOnce = 4;   // rows of them that are read at once: memory serves more streams badly
 
 #if defined(DFB_HAS_AVX2_CLONES)
 // Reads four pixels of a row in place, each value once, and adds them to `check`. Returns false if all are 0.
@@ -38,24 +39,81 @@ template <bool HasLeast>
 DFB_AVX2 bool blendFullRowsAvx2(const RowInPlace* rows, int layers, double minTransmittance, double* rgba,
                                 double* transmittance)
 {
-    const std::ptrdiff_t count = rows->span.count;
+    const std::ptrdiff_t width = rows->span.count, inFours = width - width % 4;
     Avx2ColorCheck check;
     check.clear();
     bool hasGap = false;
-    for (std::ptrdiff_t begin = 0; begin < count; begin += 4) {
-        const std::ptrdiff_t i = std::min(begin, count - 4); // the last four may overlap those before
+    // Blends rows [first, last) at four pixels, under the rows before.
+    const auto blend = [&](std::ptrdiff_t pixel, int first, int last) DFB_AVX2 {
         Avx2Colors colors;
         Avx2Block<HasLeast> block;
-        read(rows[0], i, colors, check);
-        block.take(colors, minTransmittance);
-        for (int k = 1; k < layers; ++k) {
-            read(rows[k], i, colors, check);
+        if (first == 0) {
+            read(rows[first++], pixel, colors, check);
+            block.take(colors, minTransmittance);
+        } else {
+            block.load(rgba + 4 * pixel, transmittance + pixel);
+        }
+        for (int k = first; k < last; ++k) {
+            read(rows[k], pixel, colors, check);
             block.add(colors, minTransmittance);
         }
-        block.store(rgba + 4 * i, transmittance + i);
-        hasGap |= block.isEmpty();
-    }
+        block.store(rgba + 4 * pixel, transmittance + pixel);
+        hasGap |= last == layers && block.isEmpty();
+    };
+    for (std::ptrdiff_t begin = 0; begin < inFours; begin += 256)
+        for (int first = 0; first < layers; first += rowsAtOnce)
+            for (std::ptrdiff_t i = begin; i < std::min(begin + 256, inFours); i += 4)
+                blend(i, first, std::min(first + rowsAtOnce, layers));
+    if (inFours < width)
+        blend(width - 4, 0, layers); // overlaps those before
     return !hasGap && check.isGood();
+}
+
+// Blends rows [first, last) at four pixels, under the rows before. Returns whether any has anything there.
+template <bool HasLeast>
+DFB_AVX2 DFB_INLINE bool blendFour(const RowInPlace* rows, int first, int last, std::ptrdiff_t pixel,
+                                   double minTransmittance, double* rgba, double* transmittance, Avx2ColorCheck& check)
+{
+    Avx2Block<HasLeast> block;
+    if (first == 0)
+        block.clear();
+    else
+        block.load(rgba + 4 * pixel, transmittance + pixel);
+    bool isActive = false;
+    for (int k = first; k < last; ++k) {
+        Avx2Colors colors;
+        if (!read(rows[k], pixel, colors, check))
+            continue;
+        block.add(colors, minTransmittance);
+        isActive = true;
+    }
+    block.store(rgba + 4 * pixel, transmittance + pixel);
+    return isActive;
+}
+
+// Blends pixels [begin, begin + 256) of rows that may have gaps, the front row first. Returns a bit for each four
+// pixels, set if they have anything in any row. Sets `isGood` to false if a value is not finite, or an alpha is not
+// within [0, 1].
+template <bool HasLeast>
+DFB_AVX2 std::uint64_t blendSparseRowsAvx2(const RowInPlace* rows, int layers, int begin, double minTransmittance,
+                                           double* rgba, double* transmittance, bool& isGood)
+{
+    const std::ptrdiff_t width = rows->span.count, end = std::min<std::ptrdiff_t>(begin + 256, width);
+    Avx2ColorCheck check;
+    check.clear();
+    std::uint64_t active = 0;
+    const auto blend = [&](int first, int last, std::ptrdiff_t at, std::ptrdiff_t pixel) DFB_AVX2 {
+        const bool is = blendFour<HasLeast>(rows, first, last, pixel, minTransmittance, rgba, transmittance, check);
+        active |= std::uint64_t{is} << (at - begin) / 4;
+    };
+    std::ptrdiff_t i = begin;
+    for (int first = 0; first < layers; first += rowsAtOnce)
+        for (i = begin; i + 4 <= end; i += 4)
+            blend(first, std::min(first + rowsAtOnce, layers), i, i);
+    if (i < end) // the last four pixels of the row overlap those before
+        blend(0, layers, i, width - 4);
+    isGood = isGood && check.isGood();
+    return active;
 }
 
 // Four pixels of each row that has anything in them, to be sorted.
@@ -80,6 +138,18 @@ struct SparseFour {
         return _mm_movemask_ps(wrong) == 0;
     }
     template <bool HasLeast>
+    DFB_AVX2 DFB_INLINE void blendInOrder(double* rgba, double* transmittance, double minTransmittance) const
+    {
+        Avx2Block<HasLeast> block;
+        block.clear();
+        for (int k = 0; k < layers; ++k) {
+            Avx2Colors four;
+            four.take(colors[k]);
+            block.add(four, minTransmittance);
+        }
+        block.store(rgba, transmittance);
+    }
+    template <bool HasLeast>
     DFB_AVX2 void blendSorted(double* rgba, double* transmittance, double minTransmittance) const
     {
         const float *colorsOf[mostInPlace], *depthsOf[mostInPlace];
@@ -91,49 +161,45 @@ struct SparseFour {
     }
 };
 
-// Blends pixels [begin, begin + 256) of rows that may have gaps. Returns a bit for each four pixels, set if they have
-// anything in any row. With `Sorts`, each pixel's layers are sorted by (depth, row); else the front row comes first.
-// Sets `isGood` to false if a value is not finite, an alpha is not within [0, 1], or a depth is NaN where the row has
-// anything in the four pixels.
-template <bool HasLeast, bool Sorts>
-DFB_AVX2 std::uint64_t blendSparseRowsAvx2(const RowInPlace* rows, int layers, int begin, double minTransmittance,
-                                           double* rgba, double* transmittance, bool& isGood)
+// As blendSparseRowsAvx2(), but each pixel's layers are sorted by (depth, row). Also sets `isGood` to false if a depth
+// is NaN where the row has anything in the four pixels.
+template <bool HasLeast, int AtOnce>
+DFB_AVX2 std::uint64_t sortSparseRowsAvx2(const RowInPlace* rows, int layers, int begin, double minTransmittance,
+                                          double* rgba, double* transmittance, bool& isGood)
 {
     const std::ptrdiff_t width = rows->span.count, end = std::min<std::ptrdiff_t>(begin + 256, width);
     Avx2ColorCheck check;
     check.clear();
     __m128 nan = _mm_setzero_ps();
     std::uint64_t active = 0, bit = 1;
-    SparseFour some;
-    for (std::ptrdiff_t four = begin; four < end; four += 4, bit <<= 1) {
-        const std::ptrdiff_t i = std::min(four, width - 4);
-        Avx2Block<HasLeast> block;
-        block.clear();
-        some.layers = 0;
-        for (int k = 0; k < layers; ++k) {
-            Avx2Colors colors;
-            if (!read(rows[k], i, colors, check))
-                continue;
-            active |= bit;
-            if constexpr (Sorts) {
-                prefetch(reinterpret_cast<const std::byte*>(rows[k].depthAhead + i), 64);
-                const __m128 depth = _mm_loadu_ps(rows[k].depth + i);
-                nan = _mm_or_ps(nan, _mm_cmpunord_ps(depth, depth));
-                some.add(colors, depth);
-            } else {
-                block.add(colors, minTransmittance);
-            }
+    const int step = AtOnce > 1 ? rowsAtOnce : layers;
+    SparseFour fours[AtOnce];
+    for (std::ptrdiff_t from = begin; from < end; from += 4 * AtOnce) {
+        const int count = static_cast<int>(std::min<std::ptrdiff_t>(AtOnce, (end - from + 3) / 4));
+        const auto pixel = [&](int four) { return std::min(from + 4 * four, width - 4); };
+        for (int four = 0; four < count; ++four)
+            fours[four].layers = 0;
+        for (int first = 0; first < layers; first += step)
+            for (int four = 0; four < count; ++four)
+                for (int k = first; k < std::min(first + step, layers); ++k) {
+                    const std::ptrdiff_t i = pixel(four);
+                    Avx2Colors colors;
+                    if (!read(rows[k], i, colors, check))
+                        continue;
+                    prefetch(reinterpret_cast<const std::byte*>(rows[k].depthAhead + i), 64);
+                    const __m128 depth = _mm_loadu_ps(rows[k].depth + i);
+                    nan = _mm_or_ps(nan, _mm_cmpunord_ps(depth, depth));
+                    fours[four].add(colors, depth);
+                }
+        for (int four = 0; four < count; ++four, bit <<= 1) {
+            const SparseFour& some = fours[four];
+            const std::ptrdiff_t i = pixel(four);
+            active |= some.layers > 0 ? bit : 0;
+            if (some.areSorted())
+                some.blendInOrder<HasLeast>(rgba + 4 * i, transmittance + i, minTransmittance);
+            else
+                some.blendSorted<HasLeast>(rgba + 4 * i, transmittance + i, minTransmittance);
         }
-        if (Sorts && !some.areSorted()) {
-            some.blendSorted<HasLeast>(rgba + 4 * i, transmittance + i, minTransmittance);
-            continue;
-        }
-        for (int k = 0; k < some.layers; ++k) {
-            Avx2Colors colors;
-            colors.take(some.colors[k]);
-            block.add(colors, minTransmittance);
-        }
-        block.store(rgba + 4 * i, transmittance + i);
     }
     isGood = isGood && check.isGood() && _mm_movemask_ps(nan) == 0;
     return active;
