@@ -128,15 +128,18 @@ try {
 
     dfb::ImageCompositor compositor(mpi.communicator(), isVolume ? dfb::ImageBlend::InOrder : dfb::ImageBlend::Nearest,
                                     {width, height});
-    const dfb::Box3 bounds{dfb::toFloat({box[0], box[2], box[4]}), dfb::toFloat({box[1], box[3], box[5]})};
-    const dfb::SharedWorld world(compositor, dfb::World({{unsigned(mpi.rank()), bounds}}));
-    const double* eye = renderer->GetActiveCamera()->GetPosition();
-    const auto order = dfb::visibilityOrder(world, dfb::toFloat({eye[0], eye[1], eye[2]}));
-    const auto place = std::find(order.begin(), order.end(), mpi.rank()) - order.begin();
+    int place = -1; // of this rank from front to back; surfaces need none
+    if (isVolume) {
+        const dfb::Box3 bounds{dfb::toFloat({box[0], box[2], box[4]}), dfb::toFloat({box[1], box[3], box[5]})};
+        const dfb::SharedWorld world(compositor, dfb::World({{unsigned(mpi.rank()), bounds}}));
+        const double* eye = renderer->GetActiveCamera()->GetPosition();
+        const auto order = dfb::visibilityOrder(world, dfb::toFloat({eye[0], eye[1], eye[2]}));
+        place = static_cast<int>(std::find(order.begin(), order.end(), mpi.rank()) - order.begin());
+    }
     dfb::InputImage image(rgba->GetPointer(0), isVolume ? nullptr : depths->GetPointer(0));
     image.bottomUp = true;
     image.farDepth = 1;
-    compositor.composite(image, static_cast<int>(place)); // the place matters for a volume only
+    compositor.composite(image, place);
     if (compositor.isDisplayRank())
         dfb::writePpm(argv[2], compositor.image());
 } catch (const std::exception& e) {

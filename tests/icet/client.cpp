@@ -2,7 +2,7 @@
 //   mpirun -n 3 test_icet_client errors      wrong calls, on one rank or on all
 //   mpirun -n 3 test_icet_client moves       tiles that change their size and rank from frame to frame
 //   mpirun -n 2 test_icet_client differs     ranks that have set different tiles
-//   mpirun -n 3 test_icet_client absent      a rank that does not call (DFB_ICET_TIMEOUT=1)
+//   mpirun -n 3 test_icet_client absent      a rank that does not call (DFB_ICET_TIMEOUT=1); first: not even once
 //   mpirun -n 3 test_icet_client stopped     a rank that hangs and continues later (DFB_ICET_TIMEOUT=1)
 //   mpirun -n 3 test_icet_client killed      a rank that dies; prints "all were told", then the launcher may end the
 //                                            job
@@ -357,11 +357,13 @@ void tryDifferences()
     icetDestroyContext(context);
 }
 
-void tryAbsence()
+// `isFirst`: the missing frame is the first one.
+void tryAbsence(bool isFirst)
 {
     IceTContext context = makeContext();
     icetAddTile(0, 0, 40, 30, 0);
-    expectGoodFrame("nothing");
+    if (!isFirst)
+        expectGoodFrame("nothing");
     if (rank < ranks - 1) {
         const auto before = std::chrono::steady_clock::now();
         expect(icetImageIsNull(Picture(40, 30).composite()), "a picture without one rank");
@@ -464,7 +466,9 @@ int main(int count, char** words)
     else if (what == "differs")
         tryDifferences();
     else if (what == "absent")
-        tryAbsence();
+        tryAbsence(false);
+    else if (what == "first")
+        tryAbsence(true);
     else if (what == "stopped")
         tryLoss(SIGSTOP, launched);
     else if (what == "killed")

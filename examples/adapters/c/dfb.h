@@ -13,8 +13,8 @@
 // or a failing renderer, is an error on all ranks, with the rank and the reason in dfb_last_error(). Nobody hangs, and
 // the next picture can be made. Only the communicator and the framebuffer must be right on every rank: without them a
 // rank cannot tell the others. If a rank makes another call, or none, the others wait for it; timeout_ms limits how
-// long. One thread at a time may call functions on a framebuffer. With MPI below MPI_THREAD_SERIALIZED it must be the
-// one that has initialised MPI. No exception leaves a function.
+// long they wait for a picture. One thread at a time may call functions on a framebuffer. With MPI below
+// MPI_THREAD_SERIALIZED it must be the one that has initialised MPI. No exception leaves a function.
 #ifndef DFB_H
 #define DFB_H
 
@@ -69,7 +69,8 @@ typedef struct dfb_config {
     // The longest time for a picture in milliseconds, counted from when this rank has drawn or given its part. If the
     // picture is not complete by then, the call returns DFB_FRAME_FAILED; if a rank does not answer at all, as when it
     // is dead, DFB_TRANSPORT_FAILED after twice the time. The error says which rank it waited for. Default: 0, no
-    // limit. Other calls have no limit.
+    // limit. Other calls have no limit, nor has the first dfb_render() after dfb_create() or dfb_resize(): it makes what
+    // later ones use.
     int timeout_ms;
 } dfb_config;
 

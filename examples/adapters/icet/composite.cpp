@@ -170,10 +170,9 @@ void start(dfb::ImageCompositor& picture, const Source& source, int tile, const 
     picture.start(input, plan.place, frame);
 }
 
-// Ends all pictures, then throws the first exception of any of them.
-void end(const std::vector<dfb::ImageCompositor*>& pictures, Frame& frame)
+// Ends all pictures, then throws `failure`, or else the first exception of any of them.
+void end(const std::vector<dfb::ImageCompositor*>& pictures, Frame& frame, std::exception_ptr failure)
 {
-    std::exception_ptr failure;
     frame.bytesSent = frame.tilesTouched = frame.tilesTotal = 0;
     for (dfb::ImageCompositor* picture : pictures)
         try {
@@ -224,7 +223,6 @@ private:
 void Pictures::newFrame(std::int64_t frame)
 {
     constexpr std::int64_t longAgo = 8;
-    frame_ = frame;
     entries_.erase(std::remove_if(entries_.begin(), entries_.end(),
                                   [&](const Entry& entry) { return entry.lastUse + longAgo < frame; }),
                    entries_.end());
@@ -241,10 +239,19 @@ dfb::ImageCompositor& Pictures::find(const Key& key, const IceTContextStruct& co
         dfb::FrameBufferConfig config(key.width, key.height, key.format, key.depth);
         config.image.displayRank = key.displayRank;
         config.executor = context.executor;
+        try {
+            gatherColors(context, 0); // has a time limit, unlike the constructor
+        } catch (const Error& e) {
+            dfb::ErrorInfo error;
+            error.kind = dfb::ErrorKind::Transport;
+            error.message = e.what();
+            context.connection->giveUp(error);
+            throw;
+        }
         entries_.push_back({key, 0, std::make_unique<dfb::ImageCompositor>(context.connection, key.blend, config)});
         place = entries_.end() - 1;
     }
-    place->lastUse = frame_;
+    place->lastUse = context.frame.count;
     return *place->compositor;
 }
 
@@ -283,6 +290,7 @@ IceTImage makeFrame(IceTContextStruct& context, const View& view, const Source& 
     const double before = secondsNow();
     if (!context.connection)
         throw Error(ICET_INVALID_OPERATION, "MPI has been finalised");
+    context.connection->throwIfFailed(); // ranks may still read what was rendered last
     Frame& frame = context.frame;
     ++frame.count;
     frame.isPreRendered = source.limits != nullptr;
@@ -294,9 +302,17 @@ IceTImage makeFrame(IceTContextStruct& context, const View& view, const Source& 
     const Plan plan = planOf(context);
     findContained(context, source.limits);
     const auto pictures = picturesOf(context, plan);
-    for (std::size_t i = 0; i < pictures.size(); ++i)
-        start(*pictures[i], source, static_cast<int>(i), plan, frame.count);
-    end(pictures, frame);
+    std::vector<dfb::ImageCompositor*> begun;
+    std::exception_ptr failure;
+    try {
+        for (dfb::ImageCompositor* picture : pictures) {
+            start(*picture, source, static_cast<int>(begun.size()), plan, frame.count);
+            begun.push_back(picture);
+        }
+    } catch (...) {
+        failure = std::current_exception();
+    }
+    end(begun, frame, failure);
     IceTImage result{nullptr};
     if (const int tile = context.settings.tileOf(context.rank()); tile >= 0)
         result = present(context, pictures[static_cast<std::size_t>(tile)]->image(), plan);

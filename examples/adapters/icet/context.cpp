@@ -16,25 +16,6 @@ namespace {
 
 IceTContext current = nullptr;
 
-// Returns the colour of each rank. While it waits, it yields the core to ranks that have not called yet.
-std::vector<int> gatherColors(const IceTContextStruct& context, int color)
-{
-    struct Gather {
-        int own;
-        std::vector<int> all;
-    };
-    auto gather = std::make_unique<Gather>(Gather{color, std::vector<int>(static_cast<std::size_t>(context.size()))});
-    MPI_Request request = MPI_REQUEST_NULL;
-    MPI_Iallgather(&gather->own, 1, MPI_INT, gather->all.data(), 1, MPI_INT, context.comm, &request);
-    const double limit = secondsNow() + std::chrono::duration<double>(timeLimit()).count();
-    for (int isDone = 0; MPI_Test(&request, &isDone, MPI_STATUS_IGNORE), !isDone; sched_yield())
-        if (timeLimit().count() > 0 && secondsNow() > limit) {
-            gather.release(); // MPI may still write there
-            throw Error(ICET_INVALID_OPERATION, "not all ranks call it");
-        }
-    return gather->all;
-}
-
 // All existing contexts, in the order in which they were made, which is the same on all ranks.
 std::vector<IceTContext> contexts;
 
@@ -95,10 +76,21 @@ Settings::Settings()
 
 Region Settings::wall() const
 {
-    Region all;
-    for (const Tile& tile : tiles)
-        all = hull(all, tile.viewport);
+    if (tiles.empty())
+        return {};
+    Region all = tiles.front().viewport;
+    for (const auto& [tile, displayRank] : tiles)
+        all = {std::min(all.x0, tile.x0), std::min(all.y0, tile.y0), std::max(all.x1, tile.x1),
+               std::max(all.y1, tile.y1)};
     return all;
+}
+
+std::array<int, 2> Settings::largestTile() const
+{
+    std::array<int, 2> size{};
+    for (const Tile& tile : tiles)
+        size = {std::max(size[0], tile.viewport.width()), std::max(size[1], tile.viewport.height())};
+    return size;
 }
 
 int Settings::tileOf(int displayRank) const
@@ -112,6 +104,25 @@ void requireNotDrawing(const IceTContextStruct& context)
 {
     if (context.isDrawing)
         throw Error(ICET_INVALID_OPERATION, "not while a frame is drawn");
+}
+
+std::vector<int> gatherColors(const IceTContextStruct& context, int color)
+{
+    struct Gather {
+        int own;
+        std::vector<int> all;
+    };
+    auto gather = std::make_unique<Gather>(Gather{color, std::vector<int>(static_cast<std::size_t>(context.size()))});
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Iallgather(&gather->own, 1, MPI_INT, gather->all.data(), 1, MPI_INT, context.comm, &request);
+    const double limit = secondsNow() + std::chrono::duration<double>(timeLimit()).count();
+    // While it waits, it yields the core to ranks that have not called yet.
+    for (int isDone = 0; MPI_Test(&request, &isDone, MPI_STATUS_IGNORE), !isDone; sched_yield())
+        if (timeLimit().count() > 0 && secondsNow() > limit) {
+            gather.release(); // MPI may still write there
+            throw Error(ICET_INVALID_OPERATION, "not all ranks call it");
+        }
+    return gather->all;
 }
 
 double secondsNow()

@@ -2,12 +2,12 @@
 #pragma once
 
 #include "image.hpp"
-#include "viewport.hpp"
 
 #include <IceT.h>
 #include <dfb/dfb.hpp>
 #include <mpi.h>
 
+#include <algorithm>
 #include <array>
 #include <chrono>
 #include <cstdint>
@@ -16,6 +16,17 @@
 #include <vector>
 
 namespace dfb_icet {
+
+using dfb::Region; // rows count upwards
+
+// IceT gives rectangles of pixels by their lower left corner.
+inline Region viewport(int x, int y, int width, int height) noexcept { return {x, y, x + width, y + height}; }
+
+// `part` in coordinates of the picture of `tile`. Rows of both count upwards, so no picture is flipped.
+inline Region regionIn(const Region& tile, const Region& part) noexcept
+{
+    return viewport(part.x0 - tile.x0, part.y0 - tile.y0, part.width(), part.height());
+}
 
 struct Tile {
     Region viewport;
@@ -27,7 +38,8 @@ struct Settings {
     Settings();
 
     bool isEnabled(IceTEnum option) const { return enabled[option - ICET_STATE_ENABLE_START]; }
-    Region wall() const; // all tiles
+    Region wall() const;                    // all tiles
+    std::array<int, 2> largestTile() const; // width and height, each of any tile
     int tileOf(int displayRank) const;
 
     IceTBitField diagnostics = ICET_DIAG_ALL_NODES | ICET_DIAG_WARNINGS;
@@ -66,7 +78,8 @@ public:
     };
 
     // Drops pictures that have not been used for long. Call it with the number of the context's next frame. This and
-    // find() are collective: all ranks make the same calls in the same order.
+    // find() are collective: all ranks make the same calls in the same order. If some do not, find() throws, and the
+    // connection has failed.
     void newFrame(std::int64_t frame);
     dfb::ImageCompositor& find(const Key& key, const IceTContextStruct& context);
     void clear() { entries_.clear(); }
@@ -78,7 +91,6 @@ private:
         std::unique_ptr<dfb::ImageCompositor> compositor;
     };
     std::vector<Entry> entries_;
-    std::int64_t frame_ = 0;
 };
 
 // Matrices and background that a client gives with a frame. Pointers to matrices may be null.
@@ -108,6 +120,10 @@ void findContained(IceTContextStruct& context, const Region* limits);
 dfb::InputImage inputOf(IceTContextStruct& context, const Image& image, const Region& memory, const Region& part,
                         const Region& tile);
 
+// The colour of each rank. Collective. Throws Error after timeLimit() if not all ranks call it: the communicator must
+// not be used then.
+std::vector<int> gatherColors(const IceTContextStruct& context, int color);
+
 double secondsNow();
 // Set by DFB_ICET_STATS and DFB_ICET_TIMEOUT, which is in seconds; 0: no limit.
 bool wantsStatistics();
@@ -125,7 +141,7 @@ struct IceTContextStruct {
     int rank() const noexcept { return ownRank; }
     int size() const noexcept { return static_cast<int>(order.size()); }
 
-    MPI_Comm comm = MPI_COMM_NULL;               // for icetDataReplicationGroupColor()
+    MPI_Comm comm = MPI_COMM_NULL;               // for gatherColors()
     std::shared_ptr<dfb::Connection> connection; // null after close()
     std::shared_ptr<dfb::Executor> executor;     // of all pictures
     int ownRank = 0;

@@ -49,7 +49,8 @@ void prepare(IceTContextStruct& context)
     Image& image = context.rendered;
     if (s.physicalWidth < 1 || s.physicalHeight < 1)
         throw Error(ICET_INVALID_VALUE, "icetPhysicalRenderSize() has left no pixels");
-    const std::size_t color = colorBytes(s.colorFormat), depth = depthBytes(s.depthFormat);
+    const std::size_t color = colorBytes(s.colorFormat),
+                      depth = s.depthFormat == ICET_IMAGE_DEPTH_NONE ? 0 : sizeof(float);
     image.colorFormat = s.colorFormat;
     image.depthFormat = s.depthFormat;
     image.width = s.physicalWidth;

@@ -20,15 +20,6 @@ std::size_t colorBytes(IceTEnum format)
     }
 }
 
-std::size_t depthBytes(IceTEnum format)
-{
-    switch (format) {
-    case ICET_IMAGE_DEPTH_NONE: return 0;
-    case ICET_IMAGE_DEPTH_FLOAT: return sizeof(float);
-    default: throw Error(ICET_INVALID_ENUM, "a depth format that is not known");
-    }
-}
-
 std::byte* Image::ownColor(std::size_t bytes)
 {
     owned.resize(bytes);

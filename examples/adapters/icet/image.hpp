@@ -10,9 +10,8 @@
 
 namespace dfb_icet {
 
-// Bytes of a pixel. Throw Error if there is no such format.
+// Bytes of a pixel. Throws Error if there is no such format.
 std::size_t colorBytes(IceTEnum format);
-std::size_t depthBytes(IceTEnum format);
 
 struct Image {
     IceTEnum colorFormat = ICET_IMAGE_COLOR_NONE, depthFormat = ICET_IMAGE_DEPTH_NONE;

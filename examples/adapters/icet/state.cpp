@@ -54,15 +54,12 @@ Values placesOf(const std::vector<int>& order)
 
 Values valuesOfTiles(const Settings& s, IceTEnum name)
 {
-    int width = 0, height = 0;
-    for (const Tile& tile : s.tiles)
-        width = std::max(width, tile.viewport.width()), height = std::max(height, tile.viewport.height());
     switch (name) {
     case ICET_NUM_TILES: return {double(s.tiles.size())};
     case ICET_TILE_VIEWPORTS: return each(s.tiles, [](const Tile& tile) { return of(tile.viewport); });
     case ICET_GLOBAL_VIEWPORT: return of(s.wall());
-    case ICET_TILE_MAX_WIDTH: return {double(width)};
-    case ICET_TILE_MAX_HEIGHT: return {double(height)};
+    case ICET_TILE_MAX_WIDTH: return {double(s.largestTile()[0])};
+    case ICET_TILE_MAX_HEIGHT: return {double(s.largestTile()[1])};
     case ICET_DISPLAY_NODES: return each(s.tiles, [](const Tile& tile) { return Values{double(tile.displayRank)}; });
     default: return {};
     }

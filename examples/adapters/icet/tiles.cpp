@@ -10,14 +10,6 @@ namespace dfb_icet {
 
 namespace {
 
-std::array<int, 2> largestTile(const Settings& settings)
-{
-    std::array<int, 2> size{};
-    for (const Tile& tile : settings.tiles)
-        size = {std::max(size[0], tile.viewport.width()), std::max(size[1], tile.viewport.height())};
-    return size;
-}
-
 int addTile(IceTContextStruct& context, const Tile& tile)
 {
     requireNotDrawing(context);
@@ -31,7 +23,7 @@ int addTile(IceTContextStruct& context, const Tile& tile)
         throw Error(ICET_INVALID_VALUE, "rank " + std::to_string(tile.displayRank) + " displays tile "
                                             + std::to_string(other) + " already");
     settings.tiles.push_back(tile);
-    const auto [width, height] = largestTile(settings);
+    const auto [width, height] = settings.largestTile();
     settings.physicalWidth = width;
     settings.physicalHeight = height;
     return static_cast<int>(settings.tiles.size()) - 1;
@@ -86,7 +78,7 @@ extern "C" void icetPhysicalRenderSize(IceTInt width, IceTInt height)
 {
     inContext("icetPhysicalRenderSize", [&](IceTContextStruct& context) {
         requireNotDrawing(context);
-        const auto [mostWide, mostHigh] = largestTile(context.settings);
+        const auto [mostWide, mostHigh] = context.settings.largestTile();
         if (width < mostWide || height < mostHigh)
             raiseWarning("icetPhysicalRenderSize", ICET_INVALID_VALUE, "it is smaller than a tile");
         context.settings.physicalWidth = width;

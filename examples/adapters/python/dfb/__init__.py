@@ -205,7 +205,9 @@ class ImageCompositor(_Collective):
     background    premultiplied linear RGBA behind everything
     display_rank  the rank that gets the picture
     threads       of this rank; None: its share of the processors
-    timeout       a picture that is not complete so many seconds after the last call fails; None: no limit
+    timeout       a picture fails if it is not complete so many seconds after the first rank waits for it. If a rank
+                  does not answer at all, the object is lost after twice that time. None: no limit. Other calls, such
+                  as resize(), have no limit
 
     All ranks give the same, but threads. Collective. Raises Error on all ranks.
     """
