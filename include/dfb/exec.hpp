@@ -247,7 +247,8 @@ private:
 // Has no threads of its own. Loops run on the thread that calls parallelFor(). Tasks run on that thread between two
 // iterations, on threads that call setTile() or poll(), and on a thread that waits for a frame. For ranks that have one
 // core each. With Progress::Caller as well, the library does nothing while the program does not call it, and other
-// ranks may wait.
+// ranks may wait. Framebuffers whose frames are open at the same time must share one: a rank that waits in one frame
+// runs the tasks of all of them, so that other ranks find room for their messages.
 class CallerExecutor final : public Executor {
 public:
     CallerExecutor() = default;

@@ -277,6 +277,38 @@ struct MovingSamples {
     }
 };
 
+// Pixels that stay in the image are as far off as in the frame that rendered them.
+struct KeptPixels {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 11);
+        auto config = configOf(s, 1);
+        config.precision = dfb::WireFormat::Unorm8;
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator, config);
+        const auto boundOf = [&](int firstTile, const std::vector<dfb::Brick>& bricks) {
+            std::vector<dfb::TileSamples> samples(static_cast<std::size_t>(fb.layout().tileCount()), {0, 1});
+            std::fill_n(samples.begin(), firstTile, dfb::TileSamples{0, 0});
+            auto params = paramsOf(s);
+            params.samples = std::make_shared<const std::vector<dfb::TileSamples>>(samples);
+            return dfb::DataParallelLoop(fb, dfb::World(bricks))
+                .render(
+                    scene::FlatCamera(),
+                    [](const dfb::Brick&, auto& tile) {
+                        tile.fill({0.1f, 0.1f, 0.1f, 0.3f}, 1.0f);
+                    },
+                    params)
+                .wireErrorBound;
+        };
+        const double first = boundOf(0, bricksOf(s, fb.rank(), fb.size()));
+        result.expect(first > 0, "nothing was rounded");
+        result.expect(boundOf(fb.layout().tileCount() - 1, {}) == first, "another bound while tiles are kept");
+        result.expect(boundOf(0, {}) == 0, "a bound of what is in the image no more");
+        return result;
+    }
+};
+
 // The mean is off by no more than its worst sample, however many frames ago that was.
 struct RoundedSamples {
     template <class Transport>
@@ -327,4 +359,9 @@ TEST_CASE("The image is the mean of all samples also if bricks have moved", "[ac
 TEST_CASE("How far samples may be off counts as long as they are in the image", "[accumulation]")
 {
     everywhere<frame_cases::RoundedSamples>();
+}
+
+TEST_CASE("How far pixels may be off counts as long as they are in the image", "[accumulation]")
+{
+    everywhere<frame_cases::KeptPixels>();
 }

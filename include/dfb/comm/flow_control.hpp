@@ -61,6 +61,7 @@ public:
             peer.reset(allowance_);
         }
         asking_.clear();
+        grants_.clear(); // those that could not be told for lack of memory
         underWay_ = 0;
         peakInboxBytes_ = inboxBytes_; // the next epoch's first messages may be there already
         matters_ = nullptr;

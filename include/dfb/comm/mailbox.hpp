@@ -238,7 +238,7 @@ public:
         return true;
     }
 
-    // Bytes and number of the messages to other ranks since the start.
+    // Bytes and number of the messages to other ranks since newEpoch().
     std::int64_t bytesSent() const noexcept { return bytesSent_; }
     std::int64_t messagesSent() const noexcept { return messagesSent_; }
 
@@ -260,13 +260,19 @@ public:
         return Bytes(message.data() + sizeof(MessageHeader) + sizeof(std::uint32_t), message.data() + message.size());
     }
 
-    // Without this message the reduction would never have a result. So it ends the connection if this rank lacks the
-    // memory for it.
+    // Without this message the reduction would never have a result: if this throws, giveUp().
     void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
     {
+        reductions_.receive(source, {scopeOf(message), header.number}, header.kind == MessageKind::ReduceUp,
+                            bytesOf(message));
+    }
+
+    // A message of rank `source` that needed credit has left the inbox. Ends the connection if there is no memory to
+    // say so, because other ranks may wait for the credit.
+    void consumed(int source, std::size_t byteCount)
+    {
         try {
-            reductions_.receive(source, {scopeOf(message), header.number}, header.kind == MessageKind::ReduceUp,
-                                bytesOf(message));
+            flow_.consumed(source, byteCount);
         } catch (const std::bad_alloc& e) {
             giveUp(source, errorInfo(ErrorKind::Transport, e.what()));
         }
@@ -335,7 +341,7 @@ public:
             SpinWait spin(std::chrono::microseconds(connection_->isOversubscribed() ? 30 : 1000));
             // Messages that were just queued, such as results for ranks below in the tree, must leave even if the wait
             // is over.
-            while ((!over() || (!failed() && !connection_->quiet())) && !late()) {
+            while (over() ? !failed() && !connection_->quiet() : !late()) {
                 lock.unlock();
                 // Polls before running a task, as other ranks may wait for messages that this one has queued.
                 const bool moved = connection_->poll();
@@ -723,6 +729,9 @@ private:
             }
         } catch (const Error& e) {
             giveUp(a.source, e.info()); // whichever it was, some rank waits for it
+            return;
+        } catch (const std::bad_alloc& e) {
+            giveUp(a.source, errorInfo(ErrorKind::Transport, e.what()));
             return;
         }
         handler_.incoming(a.source, a.header, std::move(a.message));

@@ -35,9 +35,10 @@ public:
     }
 
     // `first`: how long a rank waits before the first round; see interval().
-    void newFrame(std::chrono::milliseconds first)
+    explicit Quiescence(std::chrono::milliseconds first) : first_(std::max(first, std::chrono::milliseconds(1))) {}
+
+    void newFrame()
     {
-        first_ = std::max(first, std::chrono::milliseconds(1));
         rounds_ = 0;
         last_.reset();
         isInRound_ = false;
@@ -65,7 +66,7 @@ public:
     }
 
 private:
-    std::chrono::milliseconds first_{1};
+    const std::chrono::milliseconds first_;
     std::atomic<int> rounds_{0};
     std::optional<Report> last_; // of the last round
     std::atomic<bool> isInRound_{false};

@@ -15,7 +15,7 @@ namespace detail {
 class Accumulation {
 public:
     struct Start {
-        bool goesOn = false; // whether this frame continues the last one's samples
+        bool keeps = false;  // whether the image has samples or pixels of the last frame
         int firstSample = 0; // of each tile in a frame without a plan of samples
     };
 
@@ -34,7 +34,9 @@ public:
         }
         if (params.samples->size() != static_cast<std::size_t>(tileCount))
             failArgument("a plan of the samples of %zu tiles for an image of %d", params.samples->size(), tileCount);
+        bool keeps = goesOn;
         for (const TileSamples& t : *params.samples) {
+            keeps = keeps || t.count == 0;
             if (t.first < 0 || t.count < 0 || t.count > std::numeric_limits<int>::max() - t.first)
                 failArgument("a tile cannot have %d samples from %d on", t.count, t.first);
             if (traits.keepsState) {
@@ -54,7 +56,7 @@ public:
             if (!traits.pixelOpIsPointwise)
                 failArgument("a tile without samples keeps its pixels, but the pixel operation wants all tiles");
         }
-        return {goesOn, 0};
+        return {keeps, 0};
     }
 
     // Called when a frame has ended without an error. `firstSample`: the sample that it began with.

@@ -103,7 +103,7 @@ public:
         mailbox_->connection().throwIfFailed();
         const bool haveMoved = pipeline_->table().prepare(params.owners);
         params_ = params;
-        if (!start.goesOn)
+        if (!start.keeps)
             mergeErrorBound_ = 0;
         declarations_.newFrame(!lastFailed, haveMoved); // after a failed frame, owners may know of different ones
 
@@ -118,7 +118,7 @@ public:
         jobs_->newFrame();
         if (traits().opaqueHides)
             hidden_.newFrame(layout().tileCount());
-        outcome_->newFrame(FrameTerms::of(params, rank()), config_.quiet);
+        outcome_->newFrame(FrameTerms::of(params, rank()));
         inputsSent_ = 0;
         renderNs_ = -1;
         figures_.newFrame();
@@ -466,7 +466,7 @@ private:
         }
         const OpenFrame::Inside inside(&open_);
         if (hasCredit)
-            mailbox_->flow().consumed(source, byteCount);
+            mailbox_->consumed(source, byteCount);
         mailbox_->countTaken(source, header, message);
         ErrorInfo where;
         where.from = source;
@@ -757,7 +757,7 @@ private:
         };
         pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), hasFarRanks,
                                                    mailbox_->address(), sendToDisplay, fail);
-        outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
+        outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_, config_.quiet,
                                                   [this](Verdict& verdict) { addFigures(verdict); });
         // The rank after the display rank hands out jobs, as the display rank has enough to do.
         jobs_.emplace(*mailbox_, open_, *outcome_, (config_.image.displayRank + 1) % size());

@@ -32,23 +32,23 @@ public:
     // The kinds of its reductions.
     enum Scope : std::uint32_t { AllDeclared = Mailbox::ownScope + 1, FrameVerdict, Quiet = Mailbox::quietScope };
 
-    // `addFigures(verdict)` adds this rank's counts of the frame to its vote. All arguments must live as long as this
-    // object.
-    FrameOutcome(Mailbox& mailbox, OpenFrame& frame, TilePipeline& tiles, std::function<void(Verdict&)> addFigures)
-        : mailbox_(mailbox), frame_(frame), tiles_(tiles), addFigures_(std::move(addFigures))
+    // `quiet`: how long end() waits before it first looks whether any message is under way. `addFigures(verdict)` adds
+    // this rank's counts of the frame to its vote. The others must live as long as this object.
+    FrameOutcome(Mailbox& mailbox, OpenFrame& frame, TilePipeline& tiles, std::chrono::milliseconds quiet,
+                 std::function<void(Verdict&)> addFigures)
+        : mailbox_(mailbox), frame_(frame), tiles_(tiles), addFigures_(std::move(addFigures)), quiescence_(quiet)
     {
     }
 
-    // Call it before the frame is opened. `quiet`: how long end() waits before it first looks whether any message is
-    // under way.
-    void newFrame(const FrameTerms& terms, std::chrono::milliseconds quiet)
+    // Call it before the frame is opened.
+    void newFrame(const FrameTerms& terms)
     {
         terms_ = terms;
         verdict_.reset();
         isCreditInDoubt_ = false;
         endedAt_.reset();
         givesUpAt_.reset();
-        quiescence_.newFrame(quiet);
+        quiescence_.newFrame();
     }
 
     // Whether the frame has failed on some rank, or the transport has failed.

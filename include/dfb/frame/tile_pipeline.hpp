@@ -83,8 +83,7 @@ public:
         const FloatEnvironment floatEnvironment;
         faults_.reset();
         promises_.clear();
-        reports_ = {
-            {}, 0, start.goesOn ? reports_.wireErrorBound : 0}; // a mean is off by no more than its worst sample
+        reports_ = {{}, 0, start.keeps ? reports_.wireErrorBound : 0}; // a mean is no further off than its worst sample
         const SamplePlan& plan = params.samples;
         const bool hasPasses = plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; })
                                     : params.passes > 1;
@@ -267,6 +266,7 @@ public:
             failMalformed("an input in place, which this rank does not read");
         if (isLossy())
             losses_.add(fragment, coder_);
+        const FloatEnvironment floatEnvironment; // the operation may compute
         table_.arrive(std::move(fragment), from, arrival);
     }
 
@@ -334,7 +334,10 @@ public:
     // Called when the frame has ended without these tiles; see FinalGather.
     void setIncomplete(std::vector<std::int32_t>& tiles)
     {
-        gather_.setIncomplete(tiles, [this](int tile) { return !backgroundIsFine_ && table_.samples(tile).count > 0; });
+        gather_.setIncomplete(tiles, [this](int tile, bool isOwnerLost) {
+            const bool hasSamples = table_.samples(tile).count > 0; // without, it keeps its pixels
+            return isOwnerLost ? hasSamples || !traits().pixelOpIsPointwise : hasSamples && !backgroundIsFine_;
+        });
     }
 
     // The faults in the inputs of this frame that this rank has copied or read in place.

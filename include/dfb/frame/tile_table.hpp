@@ -360,10 +360,10 @@ private:
             slot = std::make_unique<Slot>();
         if (slot->frame != info_.frame) {
             const bool isEmptyYet = goesOn(tile) && !hasSamples(tile);
+            slot->trees.resize(static_cast<std::size_t>(samples(tile).count)); // first, as it may throw
             slot->frame = info_.frame;
             slot->ready = slot->touched = slot->declared = slot->hasPixels = slot->finished = false;
             slot->spoilt = slot->counted = false;
-            slot->trees.resize(static_cast<std::size_t>(samples(tile).count));
             for (DependencyTracker& tree : slot->trees)
                 tree.reset();
             const ExpectedInputs* expected = expected_;

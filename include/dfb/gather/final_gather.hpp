@@ -380,8 +380,9 @@ public:
         imageFrame_ = frame_;
     }
 
-    // Called when the frame is over without these tiles. On the display rank, adds the tiles that have not come, and
-    // background tiles for which `lost(tile)` is true. Then isComplete() is false for all of them.
+    // Called when the frame is over without these tiles. On the display rank, adds those that have not been received
+    // and for which `lost(tile, isOwnerLost)` is true; isOwnerLost: not all finished tiles of the tile's owner have
+    // come. Then isComplete() is false for all of them.
     template <class Lost>
     void setIncomplete(std::vector<std::int32_t>& tiles, const Lost& lost)
     {
@@ -390,7 +391,7 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         for (int tile = 0; tile < layout_.tileCount(); ++tile)
             if (state_[static_cast<std::size_t>(tile)] != TileState::Received
-                && (isMissing(static_cast<std::size_t>(ownerOf_(tile))) || lost(tile)))
+                && lost(tile, isMissing(static_cast<std::size_t>(ownerOf_(tile)))))
                 tiles.push_back(tile);
         std::sort(tiles.begin(), tiles.end()); // an owner may have said so already
         tiles.erase(std::unique(tiles.begin(), tiles.end()), tiles.end());

@@ -211,7 +211,7 @@ private:
     {
         const std::size_t byteCount = message.size();
         if (source != mailbox_->rank() && mailbox_->needsCredit(header.kind))
-            mailbox_->flow().consumed(source, byteCount);
+            mailbox_->consumed(source, byteCount);
         try {
             if (mailbox_->receiveCredit(source, header, message))
                 return;

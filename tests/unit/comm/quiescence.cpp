@@ -31,7 +31,7 @@ public:
         : random_(seed), loses_(loses), work_(work), ranks_(static_cast<std::size_t>(ranks))
     {
         for (Rank& r : ranks_) {
-            r.quiescence.newFrame(std::chrono::milliseconds(1));
+            r.quiescence.newFrame();
             r.tasks = pick(3);
         }
     }
@@ -58,7 +58,7 @@ public:
 
 private:
     struct Rank {
-        Quiescence quiescence;
+        Quiescence quiescence{std::chrono::milliseconds(1)};
         int tasks = 0;   // arrived messages, and own work
         int untaken = 0; // how many of them are messages
         std::uint64_t sent = 0, taken = 0;
@@ -181,9 +181,9 @@ TEST_CASE("Where a message was lost nothing is said", "[quiescence]")
 
 TEST_CASE("It takes two rounds with the same sums, as many taken as sent, and a rank that waits", "[quiescence]")
 {
-    Quiescence q;
+    Quiescence q{std::chrono::milliseconds(10)};
     const auto says = [&](const std::vector<Quiescence::Report>& rounds) {
-        q.newFrame(std::chrono::milliseconds(10));
+        q.newFrame();
         bool last = false;
         for (const Quiescence::Report& round : rounds) {
             CHECK_FALSE(last);
@@ -207,21 +207,18 @@ TEST_CASE("It takes two rounds with the same sums, as many taken as sent, and a 
 
 TEST_CASE("Rounds become rarer, up to a limit, and begin again with the next frame", "[quiescence]")
 {
-    Quiescence q;
-    for (const int first : {2000, 3}) {
-        q.newFrame(std::chrono::milliseconds(first));
+    Quiescence q{std::chrono::milliseconds(3)};
+    for (int frame = 0; frame < 2; ++frame) {
+        q.newFrame();
         std::vector<std::int64_t> waits;
         for (int round = 0; round < 8; ++round) {
             waits.push_back(q.interval().count());
             q.tryEnter();
             q.endRound(reportOf(static_cast<std::uint64_t>(round), 0));
         }
-        CHECK(waits
-              == std::vector<std::int64_t>{first, first, 2 * first, 4 * first, 8 * first, 16 * first, 16 * first,
-                                           16 * first});
+        CHECK(waits == std::vector<std::int64_t>{3, 3, 6, 12, 24, 48, 48, 48});
     }
-    q.newFrame(std::chrono::milliseconds(0));
-    CHECK(q.interval().count() == 1);
+    CHECK(Quiescence(std::chrono::milliseconds(0)).interval().count() == 1);
 }
 
 } // namespace quiescence_cases
