@@ -3,6 +3,7 @@
 
 #include "everywhere.hpp"
 
+#include <algorithm>
 #include <array>
 #include <cstddef>
 #include <cstdint>
@@ -277,6 +278,24 @@ struct MovingSamples {
     }
 };
 
+// Renders grey bricks, rounded for sending; returns the bound of the error.
+template <class FrameBuffer>
+double boundOfGrey(FrameBuffer& fb, const scene::Scene& s, std::uint64_t id, std::vector<dfb::TileSamples> samples,
+                   const std::vector<dfb::Brick>& bricks)
+{
+    auto params = paramsOf(s);
+    params.accumulationId = id;
+    params.samples = std::make_shared<const std::vector<dfb::TileSamples>>(std::move(samples));
+    return dfb::DataParallelLoop(fb, dfb::World(bricks))
+        .render(
+            scene::FlatCamera(),
+            [](const dfb::Brick&, auto& tile) {
+                tile.fill({0.1f, 0.1f, 0.1f, 0.3f}, 1.0f);
+            },
+            params)
+        .wireErrorBound;
+}
+
 // Pixels that stay in the image are as far off as in the frame that rendered them.
 struct KeptPixels {
     template <class Transport>
@@ -287,24 +306,13 @@ struct KeptPixels {
         auto config = configOf(s, 1);
         config.precision = dfb::WireFormat::Unorm8;
         dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator, config);
-        const auto boundOf = [&](int firstTile, const std::vector<dfb::Brick>& bricks) {
-            std::vector<dfb::TileSamples> samples(static_cast<std::size_t>(fb.layout().tileCount()), {0, 1});
-            std::fill_n(samples.begin(), firstTile, dfb::TileSamples{0, 0});
-            auto params = paramsOf(s);
-            params.samples = std::make_shared<const std::vector<dfb::TileSamples>>(samples);
-            return dfb::DataParallelLoop(fb, dfb::World(bricks))
-                .render(
-                    scene::FlatCamera(),
-                    [](const dfb::Brick&, auto& tile) {
-                        tile.fill({0.1f, 0.1f, 0.1f, 0.3f}, 1.0f);
-                    },
-                    params)
-                .wireErrorBound;
-        };
-        const double first = boundOf(0, bricksOf(s, fb.rank(), fb.size()));
+        const std::vector<dfb::TileSamples> all(static_cast<std::size_t>(fb.layout().tileCount()), {0, 1});
+        auto onlyLast = all;
+        std::fill_n(onlyLast.begin(), all.size() - 1, dfb::TileSamples{0, 0});
+        const double first = boundOfGrey(fb, s, 0, all, bricksOf(s, fb.rank(), fb.size()));
         result.expect(first > 0, "nothing was rounded");
-        result.expect(boundOf(fb.layout().tileCount() - 1, {}) == first, "another bound while tiles are kept");
-        result.expect(boundOf(0, {}) == 0, "a bound of what is in the image no more");
+        result.expect(boundOfGrey(fb, s, 0, onlyLast, {}) == first, "another bound while tiles are kept");
+        result.expect(boundOfGrey(fb, s, 0, all, {}) == 0, "a bound of what is in the image no more");
         return result;
     }
 };
@@ -321,18 +329,7 @@ struct RoundedSamples {
         dfb::DistributedFrameBuffer<dfb::Progressive<dfb::BasicAlphaBlend<16>>, dfb::NoPixelOp, Transport> fb(
             communicator, config);
         const auto boundOf = [&](std::uint64_t id, dfb::TileSamples samples, const std::vector<dfb::Brick>& bricks) {
-            const auto count = static_cast<std::size_t>(fb.layout().tileCount());
-            auto params = paramsOf(s);
-            params.accumulationId = id;
-            params.samples = std::make_shared<const std::vector<dfb::TileSamples>>(count, samples);
-            return dfb::DataParallelLoop(fb, dfb::World(bricks))
-                .render(
-                    scene::FlatCamera(),
-                    [](const dfb::Brick&, auto& tile) {
-                        tile.fill({0.1f, 0.1f, 0.1f, 0.3f}, 1.0f);
-                    },
-                    params)
-                .wireErrorBound;
+            return boundOfGrey(fb, s, id, {static_cast<std::size_t>(fb.layout().tileCount()), samples}, bricks);
         };
         const std::vector<dfb::Brick> own = bricksOf(s, fb.rank(), fb.size());
         const double first = boundOf(1, {0, 1}, own);
