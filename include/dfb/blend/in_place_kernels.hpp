@@ -162,7 +162,8 @@ struct SparseFour {
 };
 
 // As blendSparseRowsAvx2(), but each pixel's layers are sorted by (depth, row). Also sets `isGood` to false if a depth
-// is NaN where the row has anything in the four pixels.
+// is NaN where the row has anything in the four pixels. AtOnce: how many fours are read, rowsAtOnce rows at a time,
+// before they are blended; 1, which is faster for few rows: all rows at a time.
 template <bool HasLeast, int AtOnce>
 DFB_AVX2 std::uint64_t sortSparseRowsAvx2(const RowInPlace* rows, int layers, int begin, double minTransmittance,
                                           double* rgba, double* transmittance, bool& isGood)

@@ -340,8 +340,16 @@ public:
             // processor.
             SpinWait spin(std::chrono::microseconds(connection_->isOversubscribed() ? 30 : 1000));
             // Messages that were just queued, such as results for ranks below in the tree, must leave even if the wait
-            // is over.
-            while (over() ? !failed() && !connection_->quiet() : !late()) {
+            // is over. They get a second for it if the deadline comes sooner.
+            std::optional<Clock::time_point> leaveBy;
+            const auto goesOn = [&] {
+                if (!over())
+                    return !late();
+                if (deadline && !leaveBy)
+                    leaveBy = std::max(*deadline, Clock::now() + std::chrono::seconds(1));
+                return !failed() && !connection_->quiet() && !(leaveBy && Clock::now() >= *leaveBy);
+            };
+            while (goesOn()) {
                 lock.unlock();
                 // Polls before running a task, as other ranks may wait for messages that this one has queued.
                 const bool moved = connection_->poll();
