@@ -974,7 +974,8 @@ TEST_CASE("Frames that all ranks leave, many times over", "[errors]")
 TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are named", "[errors]")
 {
     const Scene s = scene::makeScene(6);
-    const int index = 5;
+    // `empty` gets no input, so that the owner does not vote before it has seen the mistake.
+    const int index = 5, empty = 6;
     struct Mistake {
         const char* name;
         std::function<void(const std::function<void(int, std::uint32_t, std::uint16_t, int)>&)>
@@ -998,13 +999,15 @@ TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are
     for (const Mistake& mistake : mistakes)
         for (int culprit = 0; culprit < 3; ++culprit) {
             auto config = configOf(s);
-            config.image.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == index ? 1 : 0; };
+            config.image.ownerMap = [](int tile, const dfb::TileLayout&, int) {
+                return tile == index || tile == empty ? 1 : 0;
+            };
             const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, config, [&](auto& fb) {
                 auto frame = fb.begin();
                 auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
                 if (fb.rank() == 0)
                     for (int other = 0; other < 28; ++other)
-                        if (other != index)
+                        if (other != index && other != empty)
                             send(frame, *tile, other, 0, 0, 0, 0);
                 if (fb.rank() == culprit)
                     mistake.inputs([&](int generation, std::uint32_t source, std::uint16_t part, int children) {
