@@ -73,6 +73,7 @@ package_source() {
 }
 
 make_root() {
+    [ ! -e "$root" ] || rmdir "$root" 2>/dev/null || give_up "$root is neither empty nor a Debian system"
     if ! command -v debootstrap >/dev/null 2>&1; then
         say "installing debootstrap"
         DEBIAN_FRONTEND=noninteractive apt-get -y -q install --no-install-recommends debootstrap >&2 ||
