@@ -7,14 +7,17 @@
 
 namespace example {
 
-// While an object exists, SIGINT and SIGTERM set the flag. A signal that comes more than two seconds after the first
-// ends the process as usual, because the job has not reacted. (Earlier ones do not: both a terminal and a launcher may
-// send the first signal.)
+// From the construction of an object on, SIGINT and SIGTERM set the flag. A signal that comes more than two seconds
+// after the first ends the process as usual, because the job has not reacted. (Earlier ones do not: both a terminal and
+// a launcher may send the first signal.) The destructor ends this, unless the flag is set: a launcher may be late with
+// the signal for this process, which should end with its own exit code.
 class Interrupt {
 public:
     Interrupt() : beforeInt_(install(SIGINT)), beforeTerm_(install(SIGTERM)) {}
     ~Interrupt()
     {
+        if (happened())
+            return;
         sigaction(SIGINT, &beforeInt_, nullptr);
         sigaction(SIGTERM, &beforeTerm_, nullptr);
     }

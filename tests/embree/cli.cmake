@@ -75,7 +75,7 @@ function(_add_cli_case case)
     add_test(NAME render.cli.${case}.${start}
       COMMAND ${CMAKE_COMMAND} -DSETTINGS=${_settings} -DCASE=${case} -DSTART=${start}
         -P ${CMAKE_CURRENT_SOURCE_DIR}/embree/cli_cases.cmake)
-    set_tests_properties(render.cli.${case}.${start} PROPERTIES LABELS example TIMEOUT 180)
+    set_tests_properties(render.cli.${case}.${start} PROPERTIES LABELS example TIMEOUT 900) # each run has a limit
   endforeach()
 endfunction()
 

@@ -25,6 +25,8 @@ function(run start)
   math(EXPR hardLimit "${limit} + 20")
   execute_process(COMMAND ${prefix} ${command} ${ARGN} WORKING_DIRECTORY ${work} TIMEOUT ${hardLimit}
     RESULT_VARIABLE code OUTPUT_VARIABLE out ERROR_VARIABLE err)
+  # A run of more than ten seconds tells how far it is.
+  string(REGEX REPLACE "(^|\n)frame [0-9]+ of [0-9]+, [^\n]* s( to go)?\n" "\\1" err "${err}")
   list(JOIN ARGN " " arguments)
   set(code "${code}" PARENT_SCOPE)
   set(out "${out}" PARENT_SCOPE)

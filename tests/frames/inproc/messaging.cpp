@@ -730,26 +730,29 @@ TEST_CASE("Without a peerTimeout what is damaged during a reduction ends it, als
 TEST_CASE("What is damaged when a rank has given its part of a reduction counts for what comes after it", "[messaging]")
 {
     const Scene s = sceneFor(Loop::Declared);
-    const auto board = std::make_shared<Board>();
-    std::atomic<bool> done{false};
-    const auto executor = std::make_shared<dfb::ThreadExecutor>(1);   // of rank 1
-    board->passed = [&](int from, int, const MessageHeader& header) { // the part of rank 1, which is not waiting yet
-        if (header.kind != MessageKind::ReduceUp || done.exchange(true))
-            return;
-        board->handlers.at(from)->receive(1 - from, board->pool->acquire(sizeof(MessageHeader) - 1));
-        std::promise<void> noticed;
-        executor->submit([&] { noticed.set_value(); }); // runs after the tasks submitted before
-        noticed.get_future().wait();
-    };
-    std::vector<std::string> texts(2), after(2);
-    runOn(board, 2, [&](const auto& communicator) {
-        auto config = configOf(s);
-        if (communicator.inner.rank() == 1)
-            config.executor = executor;
-        FrameBuffer<Blend> fb(communicator, config);
-        const auto rank = static_cast<std::size_t>(fb.rank());
-        texts[rank] = outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); });
-        after[rank] = outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); });
+    const auto [texts, after] = undisturbed([&] {
+        const auto board = std::make_shared<Board>();
+        std::atomic<bool> done{false};
+        const auto executor = std::make_shared<dfb::ThreadExecutor>(1); // of rank 1
+        board->passed = [&](int from, int, const MessageHeader& header) {
+            if (header.kind != MessageKind::ReduceUp || done.exchange(true))
+                return; // else it is the part of rank 1, which is not waiting yet
+            board->handlers.at(from)->receive(1 - from, board->pool->acquire(sizeof(MessageHeader) - 1));
+            std::promise<void> noticed;
+            executor->submit([&] { noticed.set_value(); }); // runs after the tasks submitted before
+            noticed.get_future().wait();
+        };
+        std::vector<std::string> first(2), second(2);
+        runOn(board, 2, [&](const auto& communicator) {
+            auto config = configOf(s);
+            if (communicator.inner.rank() == 1)
+                config.executor = executor;
+            FrameBuffer<Blend> fb(communicator, config);
+            const auto rank = static_cast<std::size_t>(fb.rank());
+            first[rank] = outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); });
+            second[rank] = outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); });
+        });
+        return std::make_pair(first, second);
     });
     INFO(joined(texts) << joined(after));
     for (std::size_t rank = 0; rank < 2; ++rank) {

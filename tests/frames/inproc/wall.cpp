@@ -3,7 +3,9 @@
 #include "catch.hpp"
 #include "random_scene.hpp"
 
+#include <future>
 #include <map>
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -51,7 +53,8 @@ TEST_CASE("A wall that is not finished for many frames drops the oldest, and say
     std::vector<std::string> dropped(2), kept(2);
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         auto connection = dfb::connect<dfb::InprocTransport>(communicator);
-        dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8);
+        const auto executor = std::make_shared<dfb::ThreadExecutor>(1);
+        dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8, executor);
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::ToWall, dfb::InprocTransport> fb(
             connection, wall.frameBufferConfig(), {&wall});
         for (int frame = 1; frame <= 17; ++frame)
@@ -59,6 +62,9 @@ TEST_CASE("A wall that is not finished for many frames drops the oldest, and say
                 const float rgba[4] = {0.5f, 0, 0, 1};
                 tile.fill(rgba);
             });
+        std::promise<void> isStored; // the part of the last frame, which the end of a frame does not wait for
+        executor->submit([&] { isStored.set_value(); });
+        isStored.get_future().wait();
         const auto me = static_cast<std::size_t>(fb.rank());
         dropped[me] = scene::outcomeOf([&] { wall.finish(1); });
         kept[me] = scene::outcomeOf([&] { wall.finish(2); });

@@ -85,7 +85,7 @@ Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Bu
                                         .render(
                                             scene::FlatCamera(), [](const dfb::Brick&, auto&) {}, params);
                 try {
-                    wall.finish(report.frame, std::chrono::milliseconds(timeoutMs));
+                    wall.finish(report.frame, std::chrono::milliseconds(shade == 0.5f ? timeoutMs : 0));
                 } catch (const dfb::Error& e) {
                     if (shade == 0.5f)
                         result.kinds[rank] = e.info().kind;

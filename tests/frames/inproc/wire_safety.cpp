@@ -232,9 +232,15 @@ TEST_CASE("A message that says what cannot be fails its frame on every rank, and
         std::optional<MessageKind> overtaken{}; // those of this kind come after it
     };
     const dfb::TileLayout layout(97, 61, 16);
-    std::int32_t ofDisplay = 0; // a tile that rank 1 does not own
-    while (dfb::latticeOwner(ofDisplay, layout, 3) == 1)
-        ++ofDisplay;
+    // A tile that rank 1 does not own, as large as this one.
+    const auto ofOther = [&](std::int32_t like) {
+        const dfb::Region size = layout.region(like);
+        std::int32_t tile = 0;
+        while (dfb::latticeOwner(tile, layout, 3) == 1 || layout.region(tile).width() != size.width()
+               || layout.region(tile).height() != size.height())
+            ++tile;
+        return tile;
+    };
     std::int32_t owned = 0; // by rank 1
     for (int tile = 0; tile < layout.tileCount(); ++tile)
         owned += dfb::latticeOwner(tile, layout, 3) == 1;
@@ -271,7 +277,8 @@ TEST_CASE("A message that says what cannot be fails its frame on every rank, and
          },
          "word of hidden inputs"},
         {"a finished tile of another owner", MessageKind::FinishedTiles, 1,
-         [=](dfb::Buffer& m) { put(m, body + 16, ofDisplay); }, "a finished tile of another owner"},
+         [&](dfb::Buffer& m) { put(m, body + 16, ofOther(dfb::detail::loadAs<std::int32_t>(m.data() + body + 16))); },
+         "a finished tile of another owner"},
         {"a batch that is longer than it says", MessageKind::FinishedTiles, 1,
          [](dfb::Buffer& m) { put(m, body, std::uint64_t{16}); }, "a batch of tiles has the wrong size"},
         {"more finished tiles than there are", MessageKind::TilesDone, 1,

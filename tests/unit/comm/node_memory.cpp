@@ -57,7 +57,8 @@ TEST_CASE("The memory has large pages, if the system makes them", "[memory]")
         return count;
     };
     // Only Linux 6.1 and later make large pages on request, and only if a free one is found.
-    if (madvise(blocks[1], page, 25) != 0)
+    const auto address = reinterpret_cast<std::uintptr_t>(blocks[1]);
+    if (madvise(reinterpret_cast<void*>(address - address % page), page, 25) != 0)
         return;
     CHECK(largePages() >= 4 * 2048);
 }
