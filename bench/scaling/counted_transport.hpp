@@ -119,7 +119,6 @@ public:
     int size() const noexcept { return inner_.size(); }
     bool needsPolling() const noexcept { return inner_.needsPolling(); }
     bool mayPoll() const noexcept { return inner_.mayPoll(); }
-    bool wakesOnArrival() const noexcept { return inner_.wakesOnArrival(); }
     bool quiet() const noexcept { return inner_.quiet(); }
     void nap(std::chrono::nanoseconds limit) { inner_.nap(limit); }
     void interrupt() { inner_.interrupt(); }

@@ -47,7 +47,7 @@ enum class Defect {
     HardlySleeps,
     IsNotInterrupted,
     ForgetsAnEarlyInterrupt, // ends a nap under way, but not the next one
-    SleepsOverSendsAndArrivals,
+    SleepsOverSends,
     ClaimsToNeedNoPolls,
     AlwaysSaysThatItMoved,
     HasAnotherRankEachTime,
@@ -94,7 +94,6 @@ public:
     int size() const { return base_.size(); }
     bool needsPolling() const { return base_.needsPolling() && !has(Defect::ClaimsToNeedNoPolls); }
     bool mayPoll() const { return true; }
-    bool wakesOnArrival() const { return true; }
     bool quiet() const { return (base_.quiet() || has(Defect::LiesAboutQuiet)) && !has(Defect::IsNeverQuiet); }
 
     void start(TransportHandler& handler)
@@ -126,7 +125,7 @@ public:
     void nap(std::chrono::nanoseconds limit)
     {
         napping_ = true;
-        if (has(Defect::SleepsOverSendsAndArrivals))
+        if (has(Defect::SleepsOverSends))
             signal_.nap(limit);
         else
             base_.nap(has(Defect::Oversleeps)     ? limit + timeLimit_ / 8
@@ -308,9 +307,7 @@ TEST_CASE("Naps that are too long or too short are found")
         {Defect::HardlySleeps, limits, "it hardly sleeps"},
         {Defect::IsNotInterrupted, limits, ", interrupted after "},
         {Defect::ForgetsAnEarlyInterrupt, limits, " just after interrupt() took "},
-        {Defect::SleepsOverSendsAndArrivals, "send() ends the nap", "messages sent during a nap of ", Over::Late,
-         Progress::Thread},
-        {Defect::SleepsOverSendsAndArrivals, "arrival ends the nap", "nap() is said to end on arrival", Over::Shuffled,
+        {Defect::SleepsOverSends, "send() ends the nap", "messages sent during a nap of ", Over::Late,
          Progress::Thread},
     });
 }

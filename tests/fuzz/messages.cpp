@@ -163,7 +163,6 @@ public:
     int size() const { return 2; }
     bool needsPolling() const { return true; }
     bool mayPoll() const { return true; }
-    bool wakesOnArrival() const { return true; }
     bool quiet() const { return true; }
     void nap(std::chrono::nanoseconds) { peer_->nap(); }
     void interrupt() {}

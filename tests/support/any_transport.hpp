@@ -48,7 +48,6 @@ public:
     int size() const { return link_->size(); }
     bool needsPolling() const { return link_->needsPolling(); }
     bool mayPoll() const { return link_->mayPoll(); }
-    bool wakesOnArrival() const { return link_->wakesOnArrival(); }
     bool quiet() const { return link_->quiet(); }
     bool poll() { return link_->poll(); }
     void nap(std::chrono::nanoseconds limit) { link_->nap(limit); }

@@ -20,7 +20,6 @@ public:
     int size() const { return inner_.size(); }
     bool needsPolling() const { return inner_.needsPolling(); }
     bool mayPoll() const { return inner_.mayPoll(); }
-    bool wakesOnArrival() const { return inner_.wakesOnArrival(); }
     bool quiet() const { return inner_.quiet(); }
     bool poll() { return inner_.poll(); }
     void nap(std::chrono::nanoseconds limit) { inner_.nap(limit); }

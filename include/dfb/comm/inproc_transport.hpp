@@ -118,7 +118,6 @@ public:
     int sharingRanks() const noexcept { return size(); }
     bool needsPolling() const noexcept { return false; }
     bool mayPoll() const noexcept { return true; }
-    bool wakesOnArrival() const noexcept { return true; }
     bool quiet() const noexcept { return true; }
     bool poll() noexcept { return false; }
     void nap(std::chrono::nanoseconds limit) { signal_.nap(limit); }

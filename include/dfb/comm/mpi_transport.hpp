@@ -115,7 +115,6 @@ public:
     {
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
     }
-    bool wakesOnArrival() const noexcept { return false; }
     // Naps are longer where ranks share cores, because waking up takes the core from a rank that computes. Naps of at
     // least 10 ms keep their length. If all that this rank waits for comes from this node, naps are long, since the
     // doorbell ends them.

@@ -108,8 +108,6 @@ private:
         // Only after a while, as the network library may need more calls to finish messages that it has taken.
         if (!expectsMessages() && quiet && idle > std::chrono::milliseconds(10))
             return longestNap_;
-        if (link_.wakesOnArrival())
-            return between(waiting_ > 0 ? 50 : 200, 2000);
         return waiting_ > 0 ? between(50, 200) : between(1000, 2000);
     }
 

@@ -8,8 +8,6 @@
 //   int rank() const; int size() const;
 //   bool needsPolling() const;                  false: messages are delivered without poll()
 //   bool mayPoll() const;                       whether the calling thread may call poll()
-//   bool wakesOnArrival() const;                whether nap() ends when a message arrives that needs poll(). A few
-//                                               polls may be needed to deliver it
 //   void start(TransportHandler&);              from now on the handler may be called
 //   void send(int destination, Buffer&&);       after start(). Any thread. Never blocks. `destination` is another rank.
 //                                               A message arrives once; messages arrive in any order. They may have any
@@ -20,7 +18,8 @@
 //   bool quiet() const;                         any thread. Whether nothing waits to be sent: all messages will then
 //                                               arrive even if this rank does not poll any more
 //   void nap(std::chrono::nanoseconds limit);   on the thread that polls. Sleeps until there is something to send,
-//                                               interrupt() is called, or `limit` has passed, or until soon after that
+//                                               interrupt() is called, or `limit` has passed, or until soon after that;
+//                                               better also until a message comes
 //   void interrupt();                           any thread, also within a call of the handler. Ends the nap under way,
 //                                               or else the next one
 //   void stop(bool orderly);                    once, after start(), when no thread is in another member. Afterwards
@@ -125,15 +124,14 @@ private:
 
 namespace detail {
 
-DFB_DETECTS(has_communicator_v, T(std::declval<const typename T::Communicator&>(), std::shared_ptr<MemoryPool>(),
-                                  Progress()));
+DFB_DETECTS(has_communicator_v,
+            T(std::declval<const typename T::Communicator&>(), std::shared_ptr<MemoryPool>(), Progress()));
 DFB_DETECTS(has_rank_and_size_v, std::declval<const T&>().rank(), std::declval<const T&>().size());
 DFB_DETECTS(has_send_v, std::declval<T&>().send(0, std::declval<Buffer&&>()));
 
 DFB_DETECTS(has_poll_v, bool{std::declval<T&>().poll()}, std::declval<const T&>().needsPolling(),
             std::declval<const T&>().mayPoll(), std::declval<const T&>().quiet());
-DFB_DETECTS(has_nap_v, std::declval<T&>().nap(std::chrono::nanoseconds()), std::declval<T&>().interrupt(),
-            std::declval<const T&>().wakesOnArrival());
+DFB_DETECTS(has_nap_v, std::declval<T&>().nap(std::chrono::nanoseconds()), std::declval<T&>().interrupt());
 DFB_DETECTS(has_start_and_stop_v, std::declval<T&>().start(std::declval<TransportHandler&>()),
             std::declval<T&>().stop(true));
 
@@ -173,8 +171,7 @@ constexpr bool checkTransport()
     static_assert(has_send_v<T>, "dfb: Transport must provide void send(int destination, Buffer&&)");
     static_assert(has_poll_v<T>, "dfb: Transport must provide bool poll(), bool needsPolling() const, "
                                  "bool mayPoll() const and bool quiet() const");
-    static_assert(has_nap_v<T>, "dfb: Transport must provide void nap(std::chrono::nanoseconds), void interrupt() "
-                                "and bool wakesOnArrival() const");
+    static_assert(has_nap_v<T>, "dfb: Transport must provide void nap(std::chrono::nanoseconds) and void interrupt()");
     static_assert(has_start_and_stop_v<T>,
                   "dfb: Transport must provide void start(TransportHandler&) and void stop(bool orderly)");
     return is_transport_v<T>;
@@ -194,7 +191,6 @@ public:
     virtual int size() const = 0;
     virtual bool needsPolling() const = 0;
     virtual bool mayPoll() const = 0;
-    virtual bool wakesOnArrival() const = 0;
     virtual bool quiet() const = 0;
     virtual void start(TransportHandler& handler) = 0;
     virtual void send(int destination, Buffer&& message) = 0;
@@ -228,7 +224,6 @@ public:
     int size() const override { return transport_.size(); }
     bool needsPolling() const override { return transport_.needsPolling(); }
     bool mayPoll() const override { return transport_.mayPoll(); }
-    bool wakesOnArrival() const override { return transport_.wakesOnArrival(); }
     bool quiet() const override { return transport_.quiet(); }
     void start(TransportHandler& handler) override { transport_.start(handler); }
     void send(int destination, Buffer&& message) override { transport_.send(destination, std::move(message)); }

@@ -32,12 +32,11 @@ struct Transport {
     bool needsPolling() const;
     bool mayPoll() const;
     bool quiet() const;
-#if defined(CASE_NO_NAP) // expect: dfb: Transport must provide void nap(std::chrono::nanoseconds), void interrupt()
+#if defined(CASE_NO_NAP) // expect: dfb: Transport must provide void nap(std::chrono::nanoseconds) and void interrupt()
 #else
     void nap(std::chrono::nanoseconds);
 #endif
     void interrupt();
-    bool wakesOnArrival() const;
 #if defined(CASE_POLL_SAYS_NOTHING) // expect: dfb: Transport must provide bool poll(), bool needsPolling() const
     void poll();
 #else

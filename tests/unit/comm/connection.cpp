@@ -43,7 +43,6 @@ public:
     int size() const { return wire_->size; }
     bool needsPolling() const { return false; }
     bool mayPoll() const { return true; }
-    bool wakesOnArrival() const { return true; }
     bool quiet() const { return true; }
     void nap(std::chrono::nanoseconds) {}
     void interrupt() {}

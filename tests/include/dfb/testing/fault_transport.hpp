@@ -119,7 +119,6 @@ public:
         return base_.needsPolling() || options_.reorder > 0 || options_.delay > 0 || options_.duplicate > 0;
     }
     bool mayPoll() const { return base_.mayPoll(); }
-    bool wakesOnArrival() const { return base_.wakesOnArrival(); }
     void interrupt() { base_.interrupt(); }
     void start(TransportHandler& handler) { base_.start(handler); }
 

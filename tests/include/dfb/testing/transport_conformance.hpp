@@ -150,7 +150,6 @@ public:
             runCase("poll() and quiet() come to rest", [this] { checkRest(); });
             runCase("nap() ends by its limit and by interrupt()", [this] { checkNap(); });
             runCase("send() ends the nap", [this] { checkNapOfSender(); });
-            runCase("arrival ends the nap", [this] { checkNapOfReceiver(); });
             runCase("stop(true) after everything has come", [this] { checkEnd(); });
             runCase("messages before start()", [this] { checkEarlyMessages(); });
             runCase("two transports at once", [this] { checkTwoAtOnce(); });
@@ -772,7 +771,7 @@ private:
         meet();
     }
 
-    // Whether a nap ends when a message is sent, or when one comes, can be seen only if another thread naps.
+    // Whether a nap ends when a message is sent can be seen only if another thread naps.
     void checkNapOfSender()
     {
         if (!session_->poller)
@@ -797,56 +796,6 @@ private:
                 problems_.add("messages sent during a nap of " + inSeconds(longNap_) + " took " + inSeconds(time));
             meet();
         }
-        session_->poller->napFor(Clock::duration::zero());
-        meet();
-    }
-
-    // Each rank plays ping-pong with the next one, and so with the one before as well.
-    void checkNapOfReceiver()
-    {
-        if (!session_->poller)
-            return;
-        constexpr std::uint64_t rounds = 10;
-        const bool wakes = session_->transport.wakesOnArrival();
-        session_->poller->napFor(wakes ? longNap_ : Clock::duration::zero());
-        meet();
-        const auto before = Clock::now();
-        std::uint64_t pings = 0, pongs = 0, sent = 0;
-        std::array<bool, 2 * rounds> seen{};
-        const auto play = [&] {
-            for (const auto& [source, message] : session_->mailbox.take()) {
-                Label found;
-                if (message.size() == smallSize)
-                    std::memcpy(&found, message.data(), sizeof found);
-                if (found.magic != testMagic || found.series != series_ || found.number >= 2 * rounds) {
-                    if (!options_.duplicatesAllowed)
-                        problems_.add("a message from rank " + std::to_string(source) + " that nobody sent");
-                } else if (std::exchange(seen[static_cast<std::size_t>(found.number)], true)) {
-                    if (!options_.duplicatesAllowed)
-                        problems_.add("a message from rank " + std::to_string(source) + " came twice");
-                } else if (found.number % 2 == 0) {
-                    ++pings;
-                    send(*session_, source, found.number + 1, smallSize);
-                } else {
-                    ++pongs;
-                }
-            }
-            if (pongs == sent && sent < rounds) {
-                std::this_thread::sleep_for(std::chrono::microseconds(500 + mix(options_.seed + sent) % 2000));
-                send(*session_, (rank_ + 1) % size_, 2 * sent++, smallSize);
-            }
-            return pings >= rounds && pongs >= rounds;
-        };
-        if (size_ > 1)
-            await(play, [&] {
-                return "after " + inSeconds(options_.timeLimit) + " only " + std::to_string(pongs) + " of "
-                       + std::to_string(rounds) + " answers came"
-                       + (wakes ? "; nap() is said to end on arrival, these took " + inSeconds(longNap_) : "");
-            });
-        if (const auto time = Clock::now() - before; wakes && time > longNap_)
-            problems_.add(std::to_string(rounds) + " messages and answers took " + inSeconds(time)
-                          + ": nap() is said to end on arrival, these took " + inSeconds(longNap_));
-        meet();
         session_->poller->napFor(Clock::duration::zero());
         meet();
     }
