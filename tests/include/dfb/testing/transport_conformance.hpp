@@ -10,7 +10,6 @@
 #include <dfb/testing/detail/conformance_tools.hpp>
 
 #include <algorithm>
-#include <array>
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
