@@ -101,7 +101,9 @@ public:
             accumulation_.begin(params, traits(), layout().tileCount(), config_.framesInFlight, lastFailed);
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
-        const bool haveMoved = pipeline_->table().prepare(params.owners);
+        const bool haveMoved = pipeline_->table().setOwners(params.owners);
+        if (haveMoved)
+            pipeline_->gather().findSenders();
         params_ = params;
         if (!start.keeps)
             mergeErrorBound_ = 0;
@@ -109,8 +111,7 @@ public:
 
         std::exception_ptr userError; // thrown by copying the data, or by the pixel operation's newFrame()
         try {
-            pipeline_->newFrame(open_.next(), params_, start, haveMoved,
-                                codecFor(config_.image.displayRank) != nullptr);
+            pipeline_->newFrame(open_.next(), params_, start, codecFor(config_.image.displayRank) != nullptr);
             copyData();
         } catch (...) {
             userError = std::current_exception();

@@ -75,10 +75,9 @@ public:
     TileTable& table() noexcept { return table_; }
     FinalGather& gather() noexcept { return gather_; }
 
-    // No other member may be running. `params` must live until the next newFrame(). `haveMoved`: what
-    // table().prepare(params.owners) has returned. `compresses`: whether finished tiles are compressed.
-    void newFrame(std::int64_t frame, const FrameConfig& params, Accumulation::Start start, bool haveMoved,
-                  bool compresses)
+    // No other member may be running. `params` must live until the next newFrame(). `compresses`: whether finished
+    // tiles are compressed.
+    void newFrame(std::int64_t frame, const FrameConfig& params, Accumulation::Start start, bool compresses)
     {
         const FloatEnvironment floatEnvironment;
         faults_.reset();
@@ -100,9 +99,7 @@ public:
         info.order = traits().takesOrder ? params.order.get() : nullptr;
         sent_ = travelling(traits(), config_, traits().keepsState || hasPasses, info.order != nullptr);
         backgroundIsFine_ = true;
-        table_.newFrame(info, plan, params.owners, haveMoved);
-        if (haveMoved)
-            gather_.findSenders();
+        table_.newFrame(info, plan);
         gather_.newFrame(frame, compresses, background_);
         losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.precision.maxColor, largestBackground(),
                          config_.minTransmittance);

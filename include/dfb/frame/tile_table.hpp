@@ -40,8 +40,7 @@ public:
         for (int tile = 0; tile < layout.tileCount(); ++tile)
             owners.push_back(ownerMap(tile, layout, rankCount));
         byMap_ = std::make_shared<const std::vector<int>>(std::move(owners));
-        prepare(byMap_, "the owner map");
-        setOwners(byMap_);
+        setOwners(byMap_, "the owner map");
         ownedByMap_ = owned_;
     } catch (const std::bad_alloc&) {
         constexpr std::size_t mostBytes = 3 * sizeof(int) + sizeof(std::unique_ptr<Slot>);
@@ -58,12 +57,14 @@ public:
     const std::vector<int>& ownedByMap() const noexcept { return ownedByMap_; }
 
     bool isMine(int tile) const noexcept { return tile >= 0 && tile < layout_.tileCount() && owner(tile) == rank_; }
-    // Makes room for the owners that newFrame() will get. Returns whether they differ from the present ones. Throws
-    // InvalidArgument if they are not valid; the text names `who` as their source.
-    bool prepare(const TileOwners& owners, const char* who = "FrameConfig::owners")
+    // Sets the owners of the next frame; null: those by the owner map. No other member may be running. Returns whether
+    // they differ from the present ones. Throws InvalidArgument if they are not valid, with nothing changed; the text
+    // names `who` as their source. Slots of tiles that this rank no longer owns are kept for other tiles.
+    bool setOwners(const TileOwners& owners, const char* who = "FrameConfig::owners")
     {
-        const std::vector<int>& next = *(owners ? owners : byMap_);
-        if (owners_ && (&next == owners_.get() || next == *owners_))
+        const TileOwners& nextOwners = owners ? owners : byMap_;
+        const std::vector<int>& next = *nextOwners;
+        if (owners_ && (nextOwners == owners_ || next == *owners_))
             return false;
         if (next.size() != slots_.size())
             failArgument("%s has %zu tiles, the image %zu", who, next.size(), slots_.size());
@@ -72,16 +73,23 @@ public:
                 failArgument("%s gives tile %zu to rank %d of %d", who, tile, next[tile], rankCount_);
         spare_.reserve(spare_.size() + owned_.size());
         owned_.reserve(static_cast<std::size_t>(std::count(next.begin(), next.end(), rank_)));
+        owners_ = nextOwners; // from here on nothing throws
+        for (const int tile : owned_)
+            if (auto& slot = slotOf(tile); slot && !isMine(tile)) {
+                slot->background = BackgroundPixels(); // others write to this tile's place from now on
+                spare_.push_back(std::move(slot));
+            }
+        owned_.clear();
+        for (int tile = 0; tile < layout_.tileCount(); ++tile)
+            if (isMine(tile))
+                owned_.push_back(tile);
         return true;
     }
     const TileInfo& frameInfo() const noexcept { return info_; }
 
-    // `info` is common to all tiles; its `rank` is set here. prepare() was called with these `owners` and has returned
-    // `haveMoved`. No other member may be running.
-    void newFrame(const TileInfo& info, const SamplePlan& plan, const TileOwners& owners, bool haveMoved)
+    // `info` is common to all tiles; its `rank` is set here. No other member may be running.
+    void newFrame(const TileInfo& info, const SamplePlan& plan)
     {
-        if (haveMoved)
-            setOwners(owners ? owners : byMap_);
         expected_ = nullptr;
         info_ = info;
         info_.rank = rank_;
@@ -325,20 +333,6 @@ private:
         return slot && slot->frame == info_.frame;
     }
 
-    // Call it after prepare(). Slots of tiles that this rank no longer owns are kept for other tiles.
-    void setOwners(const TileOwners& owners)
-    {
-        owners_ = owners;
-        for (const int tile : owned_)
-            if (auto& slot = slotOf(tile); slot && !isMine(tile)) {
-                slot->background = BackgroundPixels(); // others write to this tile's place from now on
-                spare_.push_back(std::move(slot));
-            }
-        owned_.clear();
-        for (int tile = 0; tile < layout_.tileCount(); ++tile)
-            if (isMine(tile))
-                owned_.push_back(tile);
-    }
     std::unique_ptr<Slot> takeSpare()
     {
         const std::lock_guard<std::mutex> lock(spareMutex_);

@@ -23,7 +23,7 @@ std::string outcomeOf(const dfb::detail::OperationTraits& traits, dfb::WireForma
     config.precision = format;
     d::TilePipeline pipeline(dfb::MemoryPool::create(), config, operations, 0, 1, false, 0, nullptr, nullptr);
     const dfb::FrameConfig params;
-    pipeline.newFrame(0, params, {}, pipeline.table().prepare(nullptr), false);
+    pipeline.newFrame(0, params, {}, false);
     const std::vector<float> pixels(4 * 64);
     dfb::TileView<Op::channels, 8> view;
     view.tile = 0;

@@ -91,7 +91,7 @@ Seen frame(dfb::detail::TileTable& table, std::int64_t number, Time time)
     };
     dfb::TileInfo info;
     info.frame = number;
-    table.newFrame(info, nullptr, nullptr, false);
+    table.newFrame(info, nullptr);
     dfb::detail::ExpectedInputs expected;
     expected.replace({0}, {{0, 0, 0, 0}, {1, 0, 0, 0}, {1, 1, 0, 0}});
     if (time == BeforeDeclare || time == Between)
@@ -152,10 +152,10 @@ TEST_CASE("The operations of tiles that move away are used for those that come",
     const auto same = std::make_shared<const std::vector<int>>(std::vector<int>{1, 0, 0, 1});
     std::int64_t number = 0;
     const auto frame = [&](const dfb::TileOwners& owners, const std::vector<int>& owned) {
-        const bool haveMoved = table.prepare(owners);
+        const bool haveMoved = table.setOwners(owners);
         dfb::TileInfo info;
         info.frame = number++;
-        table.newFrame(info, nullptr, owners, haveMoved);
+        table.newFrame(info, nullptr);
         CHECK(table.owned() == owned);
         CHECK(table.ownedByMap() == std::vector<int>{0, 1});
         for (int tile = 0; tile < 4; ++tile)
