@@ -147,7 +147,7 @@ public:
         if (TraceEvent* event = verdictSpan_->event())
             event->byteCount = mine.sums.bytesSent;
         if (terms_.allowPartial)
-            mine.incomplete = tiles_.table().unfinished(terms_.declared);
+            mine.incomplete = tiles_.table().unfinished();
         mailbox_.reductions().enter(verdictKey(), mine.bytes(), Verdict::combine, [this](const Bytes& result) {
             verdict_ = Verdict::from(result);
             verdictSpan_.reset();
@@ -410,7 +410,7 @@ private:
             info.expected = mailbox_.size();
             addWaitedFor(info, {AllDeclared, frame_.number()});
         } else if (!frame_.areTilesFinished()) {
-            if (const auto tile = tiles_.table().missing(terms_.declared))
+            if (const auto tile = tiles_.table().missing())
                 info = *tile;
             else
                 info.message = "tiles that have all their inputs are still being finished";

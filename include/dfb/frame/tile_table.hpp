@@ -95,6 +95,7 @@ public:
         info_.rank = rank_;
         plan_ = plan;
         arrived_ = endedEarly_ = 0;
+        touchedCount_ = 0;
         for (std::size_t tile = 0; tile < series_.size(); ++tile)
             if (const TileSamples s = samples(static_cast<int>(tile)); s.count > 0) {
                 Series& series = series_[tile];
@@ -114,6 +115,8 @@ public:
     std::int64_t arrivedCount() const noexcept { return arrived_; }
     // The number of tiles that needed no more inputs although more were to come.
     std::int64_t endedEarlyCount() const noexcept { return endedEarly_; }
+    // How many tiles have had an input in this frame.
+    int touchedCount() const noexcept { return touchedCount_; }
 
     // Returns the samples that a tile gets in this frame.
     TileSamples samples(int tile) const
@@ -136,17 +139,16 @@ public:
             Slot& slot = slotFor(h.tile);
             DependencyTracker& tree = slot.trees[static_cast<std::size_t>(h.pass)];
             tree.arrive(h.generation, h.source, h.part, h.children, from);
-            slot.touched = true;
-            if (slot.ready || slot.spoilt) {
-                ++arrived_;
-                return; // the op had enough, or is of no use
+            if (!std::exchange(slot.touched, true))
+                ++touchedCount_;
+            if (!slot.ready && !slot.spoilt) { // otherwise the op had enough, or is of no use
+                slot.hasPixels = slot.hasPixels || !fragment.empty();
+                slot.op->add(std::move(fragment));
+                const bool enough = slot.op->isComplete();
+                const bool complete = tree.complete() && allComplete(slot);
+                arrival.ready = becomesReady(slot, enough || complete);
+                endedEarly_ += enough && !complete;
             }
-            slot.hasPixels = slot.hasPixels || !fragment.empty();
-            slot.op->add(std::move(fragment));
-            const bool enough = slot.op->isComplete();
-            const bool complete = tree.complete() && allComplete(slot);
-            arrival.ready = becomesReady(slot, enough || complete);
-            endedEarly_ += enough && !complete;
             ++arrived_;
         } catch (...) {
             if (const auto& slot = slotOf(h.tile)) {
@@ -223,18 +225,15 @@ public:
         slotFor(tile).finished = true;
     }
 
-    // The tiles of this rank that should be finished in this frame but are not, and those that are spoilt. `declared`:
-    // see missing().
-    std::vector<std::int32_t> unfinished(bool declared)
+    // The tiles of this rank that should be finished in this frame but are not, and those that are spoilt.
+    std::vector<std::int32_t> unfinished()
     {
         std::vector<std::int32_t> tiles;
-        const ExpectedInputs* expected = expected_;
         for (const int tile : owned_) {
             const std::lock_guard<std::mutex> lock(mutexOf(tile));
             const auto& slot = slotOf(tile);
-            const bool isBackground = declared && expected && expected->of(tile).empty();
-            if (isTouched(tile) ? slot->spoilt || (!slot->finished && (!isBackground || slot->counted))
-                                : !isBackground && samples(tile).count > 0)
+            if (isTouched(tile) ? slot->spoilt || (!slot->finished && (!isUndeclared(tile) || slot->counted))
+                                : !isUndeclared(tile) && samples(tile).count > 0)
                 tiles.push_back(tile);
         }
         return tiles;
@@ -244,20 +243,18 @@ public:
     TileReport report(int tile) { return slotFor(tile).op->report(); }
 
     // Returns the inputs that incomplete tiles wait for: those of the first tile in numbers, those of all tiles in
-    // words. With `declared`, a tile that nobody named waits for nothing.
-    std::optional<ErrorInfo> missing(bool declared)
+    // words. In a frame with declared inputs, call it after declare().
+    std::optional<ErrorInfo> missing()
     {
         constexpr int mostTiles = 8; // in the text
-        const ExpectedInputs* expected = expected_;
         std::optional<ErrorInfo> first;
         int tiles = 0;
         std::string text;
         for (const int tile : owned_) {
-            const bool isBackground = declared && (!expected || expected->of(tile).empty());
             const std::lock_guard<std::mutex> lock(mutexOf(tile));
             const auto& slot = slotOf(tile);
             const bool touched = isTouched(tile);
-            if (touched ? slot->ready : isBackground || samples(tile).count == 0)
+            if (touched ? slot->ready : isUndeclared(tile) || samples(tile).count == 0)
                 continue;
             const DependencyTracker untouched;
             for (int pass = 0; pass < samples(tile).count; ++pass) {
@@ -282,7 +279,9 @@ public:
                         printed(samples(tile).count > 1 ? "%stile %d pass %d: " : "%stile %d: ", tiles > 1 ? "; " : "",
                                 tile, pass);
                     text += m->text();
-                    text += namesOf(*m);
+                    text += listOf("; missing source ", m->inputs, m->inputs.size());
+                    text += listOf("; announced by source ", m->announcers);
+                    text += listOf("; here are source ", m->arrived);
                 }
                 break;
             }
@@ -292,17 +291,6 @@ public:
         if (first)
             first->message = std::move(text);
         return first;
-    }
-
-    // How many tiles have had an input in this frame.
-    int touchedCount()
-    {
-        int count = 0;
-        for (const int tile : owned_) {
-            const std::lock_guard<std::mutex> lock(mutexOf(tile));
-            count += isTouched(tile) && slotOf(tile)->touched;
-        }
-        return count;
     }
 
 private:
@@ -360,8 +348,7 @@ private:
             slot->spoilt = slot->counted = false;
             for (DependencyTracker& tree : slot->trees)
                 tree.reset();
-            const ExpectedInputs* expected = expected_;
-            if (expected && expected->of(tile).empty())
+            if (isUndeclared(tile))
                 declareSlot(*slot, {});
             TileInfo info = info_;
             info.tile = tile;
@@ -381,6 +368,13 @@ private:
         return *slot;
     }
 
+    // Whether it is known that nobody has declared an input of the tile.
+    bool isUndeclared(int tile) const
+    {
+        const ExpectedInputs* expected = expected_;
+        return expected && expected->of(tile).empty();
+    }
+
     // Whether the samples of this frame follow those of the tile in earlier ones.
     bool goesOn(int tile) const { return traits().keepsState && series_[static_cast<std::size_t>(tile)].goesOn; }
     // Whether the operation has had any of those earlier samples. Then it gets this frame's, too, even if they are
@@ -398,12 +392,6 @@ private:
             tree.declare(inputs);
     }
 
-    // In words: which inputs are missing, and from which ranks; or which ranks announced them, and which have come.
-    static std::string namesOf(const DependencyTracker::Missing& missing)
-    {
-        return listOf("; missing source ", missing.inputs, missing.inputs.size())
-               + listOf("; announced by source ", missing.announcers) + listOf("; here are source ", missing.arrived);
-    }
     static std::string listOf(const char* what, const std::vector<DependencyTracker::Declared>& inputs,
                               std::size_t most = 8)
     {
@@ -441,6 +429,7 @@ private:
     std::atomic<const ExpectedInputs*> expected_{nullptr}; // null until declare()
     TileInfo info_;
     std::atomic<std::int64_t> arrived_{0}, endedEarly_{0};
+    std::atomic<int> touchedCount_{0};
     std::atomic<int> unsaid_{0}; // spoilt tiles whose errors have not been reported yet
     SamplePlan plan_;            // null: all tiles as info_ says
 };
