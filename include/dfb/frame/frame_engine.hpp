@@ -706,32 +706,18 @@ private:
     // Adds this rank's counts of the frame to the verdict, and an error if its renderer has broken a promise.
     void addFigures(Verdict& v)
     {
-        if (const int tile = pipeline_->brokenPromise(); tile >= 0 && !v.error) {
-            v.error = errorInfo(ErrorKind::InvalidArgument,
-                                "its pixels were to stay until the end of the frame (TileView::staysUntilEnd), and "
-                                "have changed",
-                                rank());
-            v.error->frame = open_.number();
-            v.error->tile = tile;
-        }
-        const auto reports = pipeline_->reports();
+        pipeline_->addTo(v);
         v.sums.bytesSent = mailbox_->bytesSent() + pipeline_->gather().placedBytes();
         v.sums.messagesSent = mailbox_->messagesSent();
         v.sums.tilesTouched = open_.areTilesFinished() ? pipeline_->table().touchedCount() : 0;
-        v.sums.nonFinitePixels = pipeline_->faults().nonFinite;
         v.sums.lateMessages = open_.takeLateCount();
         v.sums.repeatedMessages = mailbox_->connection().takeDuplicates();
-        v.sums.orderUndefinedPixels = reports.orderUndefinedPixels;
-        v.sums.alphaOutsidePixels = pipeline_->faults().alphaOutside;
         v.sums.compressedLinks = compression_.links();
         v.sums.inputsLeft = inputsSent_ - pipeline_->table().arrivedCount();
-        v.sums.tilesEndedEarly = pipeline_->table().endedEarlyCount();
         v.maxima[Verdict::PeakMemoryBytes] = static_cast<std::int64_t>(pool_->peakBytes());
         v.maxima[Verdict::RenderNs] = std::max<std::int64_t>(renderNs_, 0);
         v.maxima[Verdict::PeakInboxBytes] = static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes());
         v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
-        v.wireErrorBound = reports.wireErrorBound;
-        v.tileErrors = FrameFigures::sums(reports.errors);
         figures_.addTo(v);
     }
 

@@ -7,6 +7,7 @@
 #include <dfb/frame/accumulation.hpp>
 #include <dfb/frame/operations.hpp>
 #include <dfb/frame/tile_table.hpp>
+#include <dfb/frame/verdict.hpp>
 #include <dfb/gather/final_gather.hpp>
 #include <dfb/levels.hpp>
 #include <dfb/wire/fragment_message.hpp>
@@ -82,7 +83,10 @@ public:
         const FloatEnvironment floatEnvironment;
         faults_.reset();
         promises_.clear();
-        reports_ = {{}, 0, start.keeps ? reports_.wireErrorBound : 0}; // a mean is no further off than its worst sample
+        errors_.clear();
+        orderUndefinedPixels_ = 0;
+        if (!start.keeps)
+            wireErrorBound_ = 0; // otherwise it stays, as a mean is no further off than its worst sample
         const SamplePlan& plan = params.samples;
         const bool hasPasses = plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; })
                                     : params.passes > 1;
@@ -194,8 +198,8 @@ public:
     // Whether the owner of a tile may read its pixels where they lie, if it sees them.
     bool mayReadInPlace(const InputPixels& tile) const
     {
-        return tile.staysUntilEnd && traits().readsInPlace && !traits().keepsState && !isLossy()
-               && (sent_ & ~(colorChannel | depthChannel)) == 0 && tile.planes.at[Color] && !tile.valid.empty();
+        return tile.staysUntilEnd && readsInPlace() && (sent_ & ~(colorChannel | depthChannel)) == 0
+               && tile.planes.at[Color] && !tile.valid.empty();
     }
 
     // Returns the message for such a tile if another rank owns it. `offsetOf(address)`: the offset from the start of
@@ -227,15 +231,6 @@ public:
         const std::lock_guard<std::mutex> lock(reportsMutex_);
         promises_.push_back({tile, sum});
     }
-    // Returns a tile whose pixels have changed since notePromise(), or -1.
-    int brokenPromise()
-    {
-        const std::lock_guard<std::mutex> lock(reportsMutex_);
-        for (const Promise& promise : promises_)
-            if (checksumOf(promise.tile) != promise.checksum)
-                return promise.tile.tile;
-        return -1;
-    }
 
     // Returns the input that a message has. Throws Error (MalformedMessage).
     Fragment inputOf(Buffer&& message, const SharedBytes& sharedBytes)
@@ -258,8 +253,7 @@ public:
             failMalformed("a colour in another format than this rank's",
                           static_cast<std::int64_t>(config_.precision.color),
                           static_cast<std::int64_t>(fragment.colorFormat()));
-        if (fragment.encoding() == FragmentEncoding::InPlace
-            && (!traits().readsInPlace || traits().keepsState || isLossy()))
+        if (fragment.encoding() == FragmentEncoding::InPlace && !readsInPlace())
             failMalformed("an input in place, which this rank does not read");
         if (isLossy())
             losses_.add(fragment, coder_);
@@ -280,12 +274,13 @@ public:
         const FloatEnvironment floatEnvironment;
         if (traits().hasPixelOp ? finishThroughPixelOp(tile) : finishIntoPlace(tile))
             table_.setFinished(tile);
-        addReport(tile);
-        if (isLossy()) {
-            const double bound = losses_.boundOf(tile, std::max(1, table_.samples(tile).count));
-            const std::lock_guard<std::mutex> lock(reportsMutex_);
-            reports_.wireErrorBound = std::max(reports_.wireErrorBound, bound);
-        }
+        const TileReport report = table_.report(tile);
+        const double bound = isLossy() ? losses_.boundOf(tile, std::max(1, table_.samples(tile).count)) : 0;
+        const std::lock_guard<std::mutex> lock(reportsMutex_);
+        if (report.error >= 0)
+            errors_.push_back({static_cast<std::uint64_t>(tile), report.error});
+        orderUndefinedPixels_ += report.orderUndefinedPixels;
+        wireErrorBound_ = std::max(wireErrorBound_, bound);
     }
 
     // Picks the colour format of what is encoded from now on. `maxLayers`: the most inputs that any pixel has in a
@@ -337,19 +332,27 @@ public:
         });
     }
 
-    // The faults in the inputs of this frame that this rank has copied or read in place.
-    const FaultCounts& faults() const noexcept { return faults_; }
-
-    // The operation's reports on this rank's tiles, up to now.
-    struct Reports {
-        std::vector<Figure> errors; // by tile
-        std::int64_t orderUndefinedPixels = 0;
-        double wireErrorBound = 0;
-    };
-    Reports reports()
+    // Adds what is known up to now of this frame's inputs and of this rank's tiles, and an error if pixels have changed
+    // since notePromise() and there is no other.
+    void addTo(Verdict& verdict)
     {
+        const TileInfo& frame = table_.frameInfo();
+        verdict.sums.nonFinitePixels = faults_.nonFinite;
+        verdict.sums.alphaOutsidePixels = faults_.alphaOutside;
+        verdict.sums.tilesEndedEarly = table_.endedEarlyCount();
         const std::lock_guard<std::mutex> lock(reportsMutex_);
-        return reports_;
+        verdict.sums.orderUndefinedPixels = orderUndefinedPixels_;
+        verdict.wireErrorBound = wireErrorBound_;
+        verdict.tileErrors = FrameFigures::sums(errors_);
+        for (const Promise& promise : promises_)
+            if (!verdict.error && checksumOf(promise.tile) != promise.checksum) {
+                verdict.error = errorInfo(ErrorKind::InvalidArgument,
+                                          "its pixels were to stay until the end of the frame "
+                                          "(TileView::staysUntilEnd), and have changed",
+                                          frame.rank);
+                verdict.error->frame = frame.frame;
+                verdict.error->tile = promise.tile.tile;
+            }
     }
 
 private:
@@ -403,6 +406,7 @@ private:
         return gather_.commit(tile, std::move(place), out.writtenPixels());
     }
 
+    bool readsInPlace() const { return traits().readsInPlace && !traits().keepsState && !isLossy(); }
     PixelsInPlace inPlace(const InputPixels& tile) const { return pixelsInPlace(tile, sent_, traits().activeByDepth); }
 
     bool isLossy() const noexcept
@@ -429,17 +433,6 @@ private:
         return largest;
     }
 
-    void addReport(int tile)
-    {
-        const TileReport report = table_.report(tile);
-        if (report.error < 0 && report.orderUndefinedPixels == 0)
-            return;
-        const std::lock_guard<std::mutex> lock(reportsMutex_);
-        if (report.error >= 0)
-            reports_.errors.push_back({static_cast<std::uint64_t>(tile), report.error});
-        reports_.orderUndefinedPixels += report.orderUndefinedPixels;
-    }
-
     std::shared_ptr<MemoryPool> pool_;
     const FrameBufferConfig& config_;
     std::uint32_t address_; // of the framebuffer
@@ -459,8 +452,11 @@ private:
         std::uint32_t checksum;
     };
     std::mutex reportsMutex_;
-    Reports reports_;               // under reportsMutex_, as is promises_
+    // Under reportsMutex_:
     std::vector<Promise> promises_; // see notePromise()
+    std::vector<Figure> errors_;    // by tile, as operations report them
+    std::int64_t orderUndefinedPixels_ = 0;
+    double wireErrorBound_ = 0;
 };
 
 } // namespace detail
