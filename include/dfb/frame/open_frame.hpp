@@ -58,7 +58,7 @@ public:
         number_ += step_;
         state_ = FrameState::Rendering;
         error_.reset();
-        failed_ = damaged_ = isTold_ = false;
+        failed_ = damaged_ = false;
         tilesLeft_ = 0;
         areTilesKnown_ = areTilesFinished_ = false;
         hasInPlace_ = false;
@@ -76,16 +76,19 @@ public:
     }
 
     struct Failure {
-        bool isFirst = false; // the other ranks must be told
-        bool inTime = false;  // this rank's vote will say so
+        bool isFirst; // the other ranks must be told
+        bool inTime;  // this rank's vote will say so
     };
     // Fails the frame because of an error on this rank, or on one that has told all others. The first reason counts.
     Failure fail(const ErrorInfo& info)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        Failure result;
-        result.isFirst = !std::exchange(isTold_, true);
-        result.inTime = failNow(info);
+        damaged_ = damaged_ || info.kind == ErrorKind::MalformedMessage;
+        if (!error_) // else an error that the frame could bear, or the first reason, stays
+            error_ = info;
+        const Failure result{!failed_.exchange(true), isBeforeVote()};
+        if (result.inTime)
+            state_ = FrameState::Failed;
         return result;
     }
     // Notes that something was lost, but the frame goes on. Returns whether this rank's vote will say so: not if it has
@@ -256,22 +259,10 @@ public:
     std::int64_t takeLateCount() noexcept { return late_.exchange(0); }
 
 private:
-    // Call this and the next two under mutex_.
+    // Call this and the next one under mutex_.
     bool isBeforeVote() const noexcept
     {
         return state_ == FrameState::Rendering || state_ == FrameState::Finishing || state_ == FrameState::Failed;
-    }
-    // Returns whether this rank's vote will say so.
-    bool failNow(const ErrorInfo& info)
-    {
-        damaged_ = damaged_ || info.kind == ErrorKind::MalformedMessage;
-        if (!error_) // else an error that the frame could bear, or the first reason, stays
-            error_ = info;
-        failed_ = true;
-        const bool inTime = isBeforeVote();
-        if (inTime)
-            state_ = FrameState::Failed;
-        return inTime;
     }
     bool finishesTiles() const noexcept { return areTilesKnown_ && tilesLeft_ == 0; }
 
@@ -284,7 +275,6 @@ private:
     std::atomic<bool> areTilesKnown_{false}, areTilesFinished_{false};
     // Under mutex_:
     std::optional<ErrorInfo> error_;
-    bool isTold_ = false; // some rank has told all others that the frame has failed
     std::int64_t tilesLeft_ = 0;
     int inside_ = 0, readers_ = 0;
     bool hasInPlace_ = false;
