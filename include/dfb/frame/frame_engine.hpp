@@ -265,7 +265,7 @@ public:
 
     void requireProgress() const override { mailbox_->requireProgress(); }
 
-    // The part of end() that waits for no other rank.
+    // The part of end() that waits for no other rank. Only the first call in a frame does anything.
     void beginEnd()
     {
         if (renderNs_ >= 0)
@@ -279,6 +279,7 @@ public:
         if (pipeline_->gather().displays())
             outcome_->guarded([this] { pipeline_->finishBackground(); });
         renderNs_ = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
+        outcome_->beginEnd();
     }
 
     void tryVote() override
@@ -292,7 +293,6 @@ public:
     {
         try {
             beginEnd();
-            outcome_->beginEnd();
             poll();
             return outcome_->isConcluded();
         } catch (const TransportError&) {

@@ -46,7 +46,6 @@ public:
         terms_ = terms;
         verdict_.reset();
         isCreditInDoubt_ = false;
-        endedAt_.reset();
         givesUpAt_.reset();
         quiescence_.newFrame();
     }
@@ -79,21 +78,21 @@ public:
     }
     bool fail(ErrorInfo reason)
     {
-        const ErrorInfo info = placed(std::move(reason));
-        if (!isBearable(info.kind))
-            return failWhole(info);
-        const bool inTime = frame_.note(info);
+        if (!isBearable(reason.kind))
+            return failWhole(std::move(reason));
+        const bool inTime = frame_.note(placed(std::move(reason)));
         if (!inTime && !failed())
             frame_.countLate(); // the verdict will not contain it
         return inTime;
     }
 
     // Fails the frame even if it may be partial, because it cannot go on. Returns what fail() does.
-    bool failWhole(const ErrorInfo& reason)
+    bool failWhole(ErrorInfo reason)
     {
-        const OpenFrame::Failure failure = frame_.fail(placed(reason));
+        reason = placed(std::move(reason));
+        const OpenFrame::Failure failure = frame_.fail(reason);
         if (failure.isFirst)
-            tellOthers(placed(reason));
+            tellOthers(reason);
         if (!failure.inTime)
             frame_.countLate(); // too late to matter to this frame
         dropRest(reason.kind);
@@ -156,22 +155,20 @@ public:
         });
     }
 
-    // Called when this rank has set its last tile: from now on it votes as soon as it can.
+    // Called once a frame, when this rank has set its last tile: from now on it votes as soon as it can.
     void beginEnd()
     {
-        if (endedAt_)
-            return;
         frame_.finish();
         endedAt_ = Clock::now();
-        nextLook_ = *endedAt_ + quiescence_.interval();
+        nextLook_ = endedAt_ + quiescence_.interval();
         if (hasTimeout())
-            givesUpAt_ = *endedAt_ + 2 * terms_.timeout();
+            givesUpAt_ = endedAt_ + 2 * terms_.timeout();
         tryVote();
     }
 
-    // Whether conclude() need not wait for the verdict any longer, because it is here or will not come. Also does the
-    // work of a rank that waits: it looks now and then whether any message is under way, and makes the frame fail when
-    // its time is up.
+    // After beginEnd(): whether conclude() need not wait for the verdict any longer, because it is here or will not
+    // come. Also does the work of a rank that waits: it looks now and then whether any message is under way, and makes
+    // the frame fail when its time is up.
     bool isConcluded()
     {
         if (isDecided() || mailbox_.failed())
@@ -181,20 +178,19 @@ public:
             nextLook_ = now + quiescence_.interval();
             look();
         }
-        if (hasTimeout() && now >= *endedAt_ + terms_.timeout() && !failed())
+        if (hasTimeout() && now >= endedAt_ + terms_.timeout() && !failed())
             fail(missing(ErrorKind::TimedOut));
         if (isVerdictInDoubt())
             givesUpAt_ = now + mailbox_.connection().config().peerTimeout;
         return givesUpAt_ && now >= *givesUpAt_;
     }
 
-    // Waits for the verdict of all ranks and closes the frame, also when it throws TransportError.
+    // After beginEnd(): waits for the verdict of all ranks and closes the frame, also when it throws TransportError.
     Verdict conclude()
     {
         std::exception_ptr transportError;
         Verdict verdict;
         try {
-            beginEnd();
             do { // at least once: with Progress::Caller, wait() moves messages that others need
                 mailbox_.wait([this] { return isDecided() || isVerdictInDoubt(); }, nextEvent());
             } while (!isConcluded());
@@ -342,7 +338,7 @@ private:
     {
         auto next = nextLook_;
         if (hasTimeout() && !failed())
-            next = std::min(next, *endedAt_ + terms_.timeout());
+            next = std::min(next, endedAt_ + terms_.timeout());
         return givesUpAt_ ? std::min(next, *givesUpAt_) : next;
     }
 
@@ -426,24 +422,22 @@ private:
         return placed(std::move(info));
     }
 
-    // Adds to the message which ranks' parts of a reduction this rank waits for. Sets `from` if it can only be one
-    // rank.
+    // Adds to the message, which has a text, for which ranks' parts of a reduction this rank waits. Sets `from` if it
+    // can only be one rank.
     void addWaitedFor(ErrorInfo& info, const ReductionKey& key)
     {
         const auto missing = mailbox_.reductions().missing(key);
-        std::string text;
+        const char* separator = ", waiting for";
         for (const auto& part : missing) {
-            text += printed("%s rank %d", text.empty() ? "waiting for" : ",", part.rank);
+            info.message += printed("%s rank %d", std::exchange(separator, ","), part.rank);
             if (part.rank < mailbox_.rank())
-                text += ", through which the result comes";
+                info.message += ", through which the result comes";
             else if (part.last > part.rank)
-                text += printed(" or another up to %d, whose part comes with that one's", part.last);
+                info.message += printed(" or another up to %d, whose part comes with that one's", part.last);
         }
         if (missing.size() == 1 && missing.front().rank > mailbox_.rank()
             && missing.front().last == missing.front().rank)
             info.from = missing.front().rank;
-        if (!text.empty())
-            info.message += (info.message.empty() ? "" : ", ") + text;
     }
 
     [[noreturn]] void giveUpVerdict()
@@ -471,7 +465,7 @@ private:
     std::optional<TraceSpan> verdictSpan_;     // from this rank's vote on
     Quiescence quiescence_;
     // Only for the thread that is in end():
-    std::optional<Clock::time_point> endedAt_;   // when beginEnd() was called
+    Clock::time_point endedAt_;                  // when beginEnd() was called
     Clock::time_point nextLook_;                 // when to call look() next
     std::optional<Clock::time_point> givesUpAt_; // when to stop waiting for the verdict
 };
