@@ -43,9 +43,8 @@ public:
     {
         config_.messages.poolBytes =
             std::max(config_.messages.poolBytes, 4 * TilePipeline::largestMessage(traits(), config_));
-        MailboxOwner& self = *this;
-        mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messages.poolBytes, self,
-                                             config_.trace.get());
+        mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messages.poolBytes,
+                                             static_cast<MailboxOwner&>(*this), config_.trace.get());
         mailbox_->start();
         const auto all = agree(*mailbox_, [this] {
             checkConfig(config_, traits(), size(), mailbox_->connection().config().peerTimeout);
@@ -123,13 +122,10 @@ public:
         inputsSent_ = 0;
         renderNs_ = -1;
         figures_.newFrame();
-        std::int64_t rendered = 0;
-        for (const int tile : ownedNow())
-            rendered += pipeline_->table().samples(tile).count > 0;
         lastPoll_ = beginTime_ = Clock::now();
         mailbox_->newEpoch(open_.next());
         mailbox_->connection().expectMessages(true);
-        open(userError, rendered);
+        open(userError);
     }
 
     TileHeader headerOf(int tile, int pass) const override { return pipeline_->headerOf(tile, pass); }
@@ -202,10 +198,8 @@ public:
 
     void waitForRoom()
     {
-        const std::chrono::milliseconds limit = params_.timeout;
-        if (mailbox_->waitForRoom([this] { return outcome_->failed(); }, limit))
-            return;
-        outcome_->fail(errorInfo(ErrorKind::TimedOut, "no room for more tiles: " + mailbox_->flow().notTaken()));
+        if (!mailbox_->waitForRoom([this] { return outcome_->failed(); }, params_.timeout))
+            outcome_->fail(errorInfo(ErrorKind::TimedOut, "no room for more tiles: " + mailbox_->flow().notTaken()));
     }
 
     void declare(const std::vector<TileInput>& inputs) override
@@ -413,20 +407,22 @@ private:
             event.end = to;
             config_.trace->add(event);
         };
-        const auto rendered = renderNs_ >= 0 ? beginTime_ + std::chrono::nanoseconds(renderNs_) : end;
+        const auto rendered = beginTime_ + std::chrono::nanoseconds(renderNs_);
         add(TraceEvent::Kind::Frame, beginTime_, end);
         add(TraceEvent::Kind::Render, beginTime_, rendered);
         add(TraceEvent::Kind::End, rendered, end);
     }
 
-    // Lets messages of the frame in. `rendered`: how many of this rank's tiles have samples.
-    void open(const std::exception_ptr& userError, std::int64_t rendered)
+    // Lets messages of the frame in.
+    void open(const std::exception_ptr& userError)
     {
         // A pixel operation that is not pointwise wants to see tiles without samples, too.
-        const std::int64_t kept =
-            traits().pixelOpIsPointwise ? 0 : static_cast<std::int64_t>(ownedNow().size()) - rendered;
+        const auto isKept = [this](int tile) { return !traits().pixelOpIsPointwise && samples(tile).count == 0; };
+        const auto& tiles = ownedNow();
         auto& early = open_.open();
-        open_.expectTiles(kept + (params_.declared ? 0 : rendered));
+        open_.expectTiles(std::count_if(tiles.begin(), tiles.end(), [&](int tile) {
+            return isKept(tile) || (!params_.declared && samples(tile).count > 0);
+        }));
         if (userError) // end() throws it on all ranks; nothing is made with half of the frame's data
             outcome_->failWhole(errorInfoOf(userError, {}));
         for (Arrival& a : early)
@@ -435,8 +431,8 @@ private:
         failForDamage();
         outcome_->guarded([&] {
             const auto inside = open_.enter(open_.number());
-            for (const int tile : ownedNow())
-                if (kept > 0 && pipeline_->table().samples(tile).count == 0)
+            for (const int tile : tiles)
+                if (isKept(tile))
                     submitFinish(tile);
             if (!params_.declared && open_.expectNoMore())
                 allFinished();
@@ -539,8 +535,11 @@ private:
             if (body.word < HiddenTiles::Word::Hides || body.word > HiddenTiles::Word::Shows)
                 failMalformed("word of hidden inputs that there is not", 2, static_cast<std::int64_t>(body.word));
             takeWord(body);
-        } else if (kind == MessageKind::Manifest || kind == MessageKind::ManifestAck) {
-            receiveDeclaration(source, header, message);
+        } else if (kind == MessageKind::Manifest) {
+            receiveManifest(source, message);
+        } else if (kind == MessageKind::ManifestAck) {
+            if (declarations_.acknowledged(source))
+                enterAllDeclared();
         } else {
             jobs_->receive(source, header, message);
         }
@@ -552,18 +551,13 @@ private:
         mailbox_->notify(); // wakes waitForWord()
     }
 
-    void receiveDeclaration(int source, const MessageHeader& header, const Buffer& message)
+    void receiveManifest(int source, const Buffer& message)
     {
-        if (header.kind == MessageKind::ManifestAck) {
-            if (declarations_.acknowledged(source))
-                enterAllDeclared();
-            return;
-        }
-        if (!params_.declared) {
+        if (!params_.declared)
             throw Error(
                 errorInfo(ErrorKind::Disagreement, "the sender declares its inputs, this rank expects no declaration"));
-        }
-        declarations_.receive(source, ByteReader(message.data() + sizeof header, message.size() - sizeof header),
+        constexpr std::size_t before = sizeof(MessageHeader);
+        declarations_.receive(source, ByteReader(message.data() + before, message.size() - before),
                               [this](int tile) { return pipeline_->table().isMine(tile); });
         mailbox_->send(source, MessageKind::ManifestAck, open_.number());
     }
