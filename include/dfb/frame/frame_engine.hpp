@@ -224,12 +224,8 @@ public:
 
     void abort(std::int64_t frame, const std::exception_ptr& reason, int tile) override
     {
-        const auto inside = open_.enter(frame);
-        if (!inside)
-            return; // the frame is over
-        ErrorInfo where;
-        where.tile = tile;
-        outcome_->fail(reason, where);
+        if (const auto inside = open_.enter(frame)) // otherwise the frame is over
+            failTile(reason, tile);
     }
 
     bool poll() override
@@ -308,12 +304,12 @@ public:
             accumulation_.ended(params_, pipeline_->table().frameInfo().firstSample);
         }
 
-        const double nsPerMs = 1e6;
+        using Ms = std::chrono::duration<double, std::milli>;
         FrameReport report;
         report.frame = open_.number();
         ending.time = Clock::now();
-        report.totalMs = static_cast<double>(std::chrono::nanoseconds(ending.time - beginTime_).count()) / nsPerMs;
-        report.renderMs = static_cast<double>(renderNs_) / nsPerMs;
+        report.totalMs = Ms(ending.time - beginTime_).count();
+        report.renderMs = Ms(std::chrono::nanoseconds(renderNs_)).count();
         report.compositingOverheadMs = report.totalMs - report.renderMs;
         report.tilesTotal = layout().tileCount();
         report.wireColor = pipeline_->wireColor();
@@ -497,6 +493,13 @@ private:
         mailbox_->keepDamage(error);                         // first: begin() opens the frame and then looks for damage
         if (const auto inside = open_.enter(open_.number())) // held to the end: the next begin() waits for it
             failForDamage();
+    }
+
+    void failTile(const std::exception_ptr& reason, int tile)
+    {
+        ErrorInfo where;
+        where.tile = tile;
+        outcome_->fail(reason, where);
     }
 
     void failForDamage()
@@ -731,13 +734,9 @@ private:
                 compression_.sent(config_.image.displayRank, raw, message.size());
             mailbox_->send(config_.image.displayRank, std::move(message));
         };
-        const auto fail = [this](const std::exception_ptr& reason, int tile) {
-            ErrorInfo where;
-            where.tile = tile;
-            outcome_->fail(reason, where);
-        };
-        pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), hasFarRanks,
-                                                   mailbox_->address(), sendToDisplay, fail);
+        pipeline_ = std::make_unique<TilePipeline>(
+            pool_, config_, operations_, rank(), size(), hasFarRanks, mailbox_->address(), sendToDisplay,
+            [this](const std::exception_ptr& reason, int tile) { failTile(reason, tile); });
         outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_, config_.quiet,
                                                   [this](Verdict& verdict) { addFigures(verdict); });
         // The rank after the display rank hands out jobs, as the display rank has enough to do.

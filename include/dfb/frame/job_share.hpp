@@ -32,7 +32,7 @@ public:
     void newFrame()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        next_ = count_ = -1;
+        askedOf_ = count_ = -1;
         mine_.clear();
         asked_ = exhausted_ = false;
     }
@@ -41,10 +41,9 @@ public:
     JobRange give(const JobRequest& request, int rankCount)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        if (request.count < 0 || request.workers < 1 || (next_ >= 0 && request.count != handedOutOf_))
-            failMalformed("a request for jobs that cannot be", next_ < 0 ? -1 : handedOutOf_, request.count);
-        handedOutOf_ = request.count;
-        if (next_ < 0)
+        if (request.count < 0 || request.workers < 1 || (askedOf_ >= 0 && request.count != askedOf_))
+            failMalformed("a request for jobs that cannot be", askedOf_, request.count);
+        if (std::exchange(askedOf_, request.count) < 0)
             next_ = fixedPart(request.count);
         const std::int64_t left = request.count - next_;
         const std::int64_t size =
@@ -99,9 +98,9 @@ private:
     static std::int64_t fixedPart(std::int64_t count) { return count / 2; }
 
     mutable std::mutex mutex_;
-    std::int64_t next_ = -1; // to hand out; -1: nobody has asked yet
-    std::int64_t handedOutOf_ = 0;
-    std::int64_t count_ = -1; // of all jobs; -1: nothing was taken yet
+    std::int64_t askedOf_ = -1; // the number of all jobs, from requests; -1: nobody has asked yet
+    std::int64_t next_ = 0;     // to hand out
+    std::int64_t count_ = -1;   // of all jobs; -1: nothing was taken yet
     Fifo<JobRange> mine_;
     bool asked_ = false, exhausted_ = false;
 };
