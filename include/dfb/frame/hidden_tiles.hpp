@@ -32,41 +32,34 @@ public:
 
     void newFrame(int tileCount)
     {
-        if (from_.size() != static_cast<std::size_t>(tileCount)) {
-            from_ = std::vector<std::atomic<std::int32_t>>(static_cast<std::size_t>(tileCount));
-            open_ = std::vector<std::vector<Open>>(from_.size());
-        } else if (!any_) {
-            return;
-        }
-        for (auto& from : from_)
-            from = none;
-        for (auto& open : open_)
-            open.clear();
+        if (tiles_.size() != static_cast<std::size_t>(tileCount))
+            tiles_ = std::vector<Tile>(static_cast<std::size_t>(tileCount));
+        else if (any_)
+            for (Tile& tile : tiles_) {
+                tile.from = none;
+                tile.open.clear();
+            }
         any_ = anyOpen_ = false;
     }
 
     void take(const Message& message)
     {
+        const std::lock_guard<std::mutex> lock(mutex_);
         any_ = true;
-        if (message.word == Word::Hides) {
-            auto& from = from_[static_cast<std::size_t>(message.tile)];
-            std::int32_t before = from;
-            while (message.generation < before && !from.compare_exchange_weak(before, message.generation)) {
-            }
-        }
+        Tile& tile = tiles_[static_cast<std::size_t>(message.tile)];
+        if (message.word == Word::Hides)
+            tile.from = std::min(tile.from.load(), message.generation);
         if (message.word == Word::MayHide)
             anyOpen_ = true;
-        const std::lock_guard<std::mutex> lock(mutex_);
-        auto& open = open_[static_cast<std::size_t>(message.tile)];
-        auto at =
-            std::find_if(open.begin(), open.end(), [&](const Open& o) { return o.generation == message.generation; });
-        if (at == open.end())
-            at = open.insert(open.end(), {message.generation, 0});
+        auto at = std::find_if(tile.open.begin(), tile.open.end(),
+                               [&](const Open& o) { return o.generation == message.generation; });
+        if (at == tile.open.end())
+            at = tile.open.insert(at, {message.generation, 0});
         at->count += message.word == Word::MayHide ? 1 : -1; // the words may overtake each other
     }
 
     // The first generation that cannot be seen.
-    int from(int tile) const { return any_ ? from_[static_cast<std::size_t>(tile)].load() : none; }
+    int from(int tile) const { return any_ ? tiles_[static_cast<std::size_t>(tile)].from.load() : none; }
 
     // Whether a word is still to come that may hide an input which is not hidden yet.
     bool isUndecided(int tile, int generation) const
@@ -74,7 +67,7 @@ public:
         if (!anyOpen_ || generation >= from(tile))
             return false;
         const std::lock_guard<std::mutex> lock(mutex_);
-        const auto& open = open_[static_cast<std::size_t>(tile)];
+        const auto& open = tiles_[static_cast<std::size_t>(tile)].open;
         return std::any_of(open.begin(), open.end(),
                            [&](const Open& o) { return o.count > 0 && o.generation <= generation; });
     }
@@ -85,10 +78,13 @@ private:
         int count;
     };
     static constexpr std::int32_t none = std::numeric_limits<std::int32_t>::max();
-    std::vector<std::atomic<std::int32_t>> from_;
+    struct Tile {
+        std::atomic<std::int32_t> from{none}; // the first generation that is hidden; set under mutex_
+        std::vector<Open> open;               // under mutex_
+    };
+    std::vector<Tile> tiles_;
     std::atomic<bool> any_{false}, anyOpen_{false};
     mutable std::mutex mutex_;
-    std::vector<std::vector<Open>> open_; // by tile; under mutex_
 };
 
 } // namespace detail
