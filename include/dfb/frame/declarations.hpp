@@ -23,10 +23,7 @@ DFB_NAMESPACE_BEGIN
 namespace detail {
 
 // An input that will come for a tile.
-struct ExpectedInput {
-    int tile = 0;
-    std::uint32_t source = 0;
-    std::uint16_t part = 0;
+struct ExpectedInput : TileInput {
     int rank = 0; // the rank that has declared it
 };
 
@@ -118,9 +115,7 @@ public:
             for (const Addressed& its : news_) // all of them, before the first can answer
                 if (its.owner == rank) {
                     changedRanks_.push_back(rank);
-                    forEachOf(its.owner, [&](const TileInput& input) {
-                        changedInputs_.push_back({input.tile, input.source, input.part, rank});
-                    });
+                    forEachOf(its.owner, [&](const TileInput& input) { changedInputs_.push_back({input, rank}); });
                 } else {
                     acksMissing_.push_back(its.owner);
                     isWaiting = true;
@@ -160,7 +155,7 @@ public:
                 info.source = source;
                 throw Error(std::move(info));
             }
-            changedInputs_.push_back({tile, source, part, from});
+            changedInputs_.push_back({{tile, source, part}, from});
         }
     }
 

@@ -93,7 +93,7 @@ Seen frame(dfb::detail::TileTable& table, std::int64_t number, Time time)
     info.frame = number;
     table.newFrame(info, nullptr);
     dfb::detail::ExpectedInputs expected;
-    expected.replace({0}, {{0, 0, 0, 0}, {1, 0, 0, 0}, {1, 1, 0, 0}});
+    expected.replace({0}, {{{0, 0, 0}, 0}, {{1, 0, 0}, 0}, {{1, 1, 0}, 0}});
     if (time == BeforeDeclare || time == Between)
         arrive(0);
     if (time == BeforeDeclare)
