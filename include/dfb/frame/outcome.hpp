@@ -243,7 +243,7 @@ private:
     {
         return terms_.allowPartial && !isMissing(kind) && kind != ErrorKind::Cancelled
                && kind != ErrorKind::Disagreement
-               && (kind != ErrorKind::MalformedMessage || terms_.timeoutMs > 0); // it is waited for until the time-out
+               && (kind != ErrorKind::MalformedMessage || hasTimeout()); // it is waited for until the time-out
     }
 
     void tellOthers(const ErrorInfo& info)
@@ -406,9 +406,8 @@ private:
             info.expected = mailbox_.size();
             addWaitedFor(info, {AllDeclared, frame_.number()});
         } else if (!frame_.areTilesFinished()) {
-            if (const auto tile = tiles_.table().missing())
-                info = *tile;
-            else
+            info = tiles_.table().missing();
+            if (info.message.empty())
                 info.message = "tiles that have all their inputs are still being finished";
         } else if (!tiles_.gather().complete()) {
             info = tiles_.gather().missing();

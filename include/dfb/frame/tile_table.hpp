@@ -19,7 +19,6 @@
 #include <memory>
 #include <mutex>
 #include <new>
-#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -173,12 +172,11 @@ public:
         std::exception_ptr failure;
         for (const int tile : owned_) {
             const ExpectedInputs::Range inputs = expected.of(tile);
-            const bool named = !inputs.empty();
             bool complete = false;
             {
                 const std::lock_guard<std::mutex> lock(mutexOf(tile));
                 const auto& slot = slotOf(tile);
-                if ((!named && !all && !isTouched(tile) && !hasSamples(tile)) || samples(tile).count == 0)
+                if ((inputs.empty() && !all && !isTouched(tile) && !hasSamples(tile)) || samples(tile).count == 0)
                     continue;
                 try {
                     if (Slot& its = slotFor(tile); !its.declared)
@@ -243,13 +241,12 @@ public:
     TileReport report(int tile) { return slotFor(tile).op->report(); }
 
     // Returns the inputs that incomplete tiles wait for: those of the first tile in numbers, those of all tiles in
-    // words. In a frame with declared inputs, call it after declare().
-    std::optional<ErrorInfo> missing()
+    // words. The text is empty if no tile waits. In a frame with declared inputs, call it after declare().
+    ErrorInfo missing()
     {
         constexpr int mostTiles = 8; // in the text
-        std::optional<ErrorInfo> first;
+        ErrorInfo info;
         int tiles = 0;
-        std::string text;
         for (const int tile : owned_) {
             const std::lock_guard<std::mutex> lock(mutexOf(tile));
             const auto& slot = slotOf(tile);
@@ -262,35 +259,32 @@ public:
                 const auto m = tree.missing();
                 if (!m)
                     continue;
-                if (!first) {
-                    first.emplace();
-                    first->tile = tile;
-                    first->pass = pass;
-                    first->generation = m->generation;
-                    first->source = m->inputs.empty() ? -1 : static_cast<std::int64_t>(m->inputs.front().source);
-                    first->from = !m->inputs.empty()      ? m->inputs.front().rank
-                                  : m->announcers.empty() ? -1
-                                                          : m->announcers.front().rank;
-                    first->expected = m->expected;
-                    first->got = m->got;
+                if (++tiles == 1) {
+                    info.tile = tile;
+                    info.pass = pass;
+                    info.generation = m->generation;
+                    info.source = m->inputs.empty() ? -1 : static_cast<std::int64_t>(m->inputs.front().source);
+                    info.from = !m->inputs.empty()      ? m->inputs.front().rank
+                                : m->announcers.empty() ? -1
+                                                        : m->announcers.front().rank;
+                    info.expected = m->expected;
+                    info.got = m->got;
                 }
-                if (++tiles <= mostTiles) {
-                    text +=
+                if (tiles <= mostTiles) {
+                    info.message +=
                         printed(samples(tile).count > 1 ? "%stile %d pass %d: " : "%stile %d: ", tiles > 1 ? "; " : "",
                                 tile, pass);
-                    text += m->text();
-                    text += listOf("; missing source ", m->inputs, m->inputs.size());
-                    text += listOf("; announced by source ", m->announcers);
-                    text += listOf("; here are source ", m->arrived);
+                    info.message += m->text();
+                    info.message += listOf("; missing source ", m->inputs, m->inputs.size());
+                    info.message += listOf("; announced by source ", m->announcers);
+                    info.message += listOf("; here are source ", m->arrived);
                 }
                 break;
             }
         }
         if (tiles > mostTiles)
-            text += printed("; and %d more tiles", tiles - mostTiles);
-        if (first)
-            first->message = std::move(text);
-        return first;
+            info.message += printed("; and %d more tiles", tiles - mostTiles);
+        return info;
     }
 
 private:
