@@ -12,6 +12,7 @@
 #include <dfb/frame.hpp>
 
 #include <algorithm>
+#include <atomic>
 #include <cstdint>
 #include <iterator>
 #include <mutex>
@@ -94,7 +95,6 @@ public:
     {
         const bool haveMoved = std::exchange(haveMoved_, false);
         if (inputs == mine_ && !haveMoved) {
-            const std::lock_guard<std::mutex> lock(mutex_);
             declared_ = true;
             return false;
         }
@@ -181,11 +181,7 @@ public:
         expected_.replace(changedRanks_, changedInputs_);
     }
 
-    bool declared() const
-    {
-        std::lock_guard<std::mutex> lock(mutex_);
-        return declared_;
-    }
+    bool declared() const { return declared_; }
 
     // The inputs that will come, per owned tile. Read it after complete().
     const ExpectedInputs& expected() const { return expected_; }
@@ -211,12 +207,13 @@ private:
             take(its->input);
     }
 
-    mutable std::mutex mutex_;
+    std::mutex mutex_;
     ExpectedInputs expected_;                  // as of the last complete()
     std::vector<int> changedRanks_;            // ranks that have told this owner something new in this frame
     std::vector<ExpectedInput> changedInputs_; // their new inputs
     std::vector<int> acksMissing_;             // owners that have not acknowledged
-    bool declared_ = false, isComplete_ = false;
+    bool isComplete_ = false;
+    std::atomic<bool> declared_{false};
 
     // Only declare() and newFrame() use them.
     std::vector<TileInput> mine_;          // what was declared last

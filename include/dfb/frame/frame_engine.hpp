@@ -36,7 +36,7 @@ public:
     using Bytes = ReductionTable::Bytes;
 
     // `operations` must live as long as this; `slot`: which of config.framesInFlight engines this is.
-    FrameEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config, Operations& operations, int slot = 0)
+    FrameEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config, Operations& operations, int slot)
         : pool_(connection->pool()), config_(std::move(config)), operations_(operations),
           open_(slot + 1, std::max(1, config_.framesInFlight)),
           compression_(config_.messages.codec, config_.messages.compression, connection->size())
@@ -145,7 +145,9 @@ public:
             Buffer message = isInPlace ? encodePlace(tile, owner) : Buffer();
             mailbox_->send(owner, message.empty() ? encode(tile, owner) : std::move(message));
             ++inputsSent_;
-            waitForRoom();
+            if (!mailbox_->waitForRoom([this] { return outcome_->failed(); }, params_.timeout))
+                outcome_->fail(
+                    errorInfo(ErrorKind::TimedOut, "no room for more tiles: " + mailbox_->flow().notTaken()));
         } else if (const auto inside = open_.enter(tile.frame)) {
             if (isInPlace)
                 arrive([&] { return pipeline_->inputOf(tile); }, rank(), true);
@@ -194,12 +196,6 @@ public:
         if (count < 0)
             failArgument("nextJobs() of %lld jobs", static_cast<long long>(count));
         return jobs_->next(count, params_.timeout);
-    }
-
-    void waitForRoom()
-    {
-        if (!mailbox_->waitForRoom([this] { return outcome_->failed(); }, params_.timeout))
-            outcome_->fail(errorInfo(ErrorKind::TimedOut, "no room for more tiles: " + mailbox_->flow().notTaken()));
     }
 
     void declare(const std::vector<TileInput>& inputs) override
