@@ -680,13 +680,11 @@ private:
         declarations_.complete();
         if (outcome_->failed())
             return;
-        // A pixel operation that is not pointwise sees background tiles too.
-        const bool all = !traits().pixelOpIsPointwise;
         ErrorInfo where;
         const bool declared = outcome_->guarded(
             [&] {
                 pipeline_->table().declare(
-                    declarations_.expected(), all, where, [this](int) { open_.expectTiles(1); },
+                    declarations_.expected(), where, [this](int) { open_.expectTiles(1); },
                     [this](int tile) { submitFinish(tile); });
             },
             where);

@@ -162,11 +162,11 @@ public:
 
     // Takes the inputs that each tile will get in each pass; a tile that is not named gets none. First calls
     // `counted(tile)` for each tile that waits for inputs, then `ready(tile)` for each tile whose inputs are all there.
-    // With `all`, also calls them for tiles without inputs. `expected` must live as long as the frame. If the tracker
-    // or the operation throws, this goes on with the other tiles and throws at the end; `where` then names the first
-    // tile that failed.
+    // Also calls them for tiles without inputs if the pixel operation is not pointwise. `expected` must live as long as
+    // the frame. If the tracker or the operation throws, this goes on with the other tiles and throws at the end;
+    // `where` then names the first tile that failed.
     template <class Counted, class Ready>
-    void declare(const ExpectedInputs& expected, bool all, ErrorInfo& where, const Counted& counted, const Ready& ready)
+    void declare(const ExpectedInputs& expected, ErrorInfo& where, const Counted& counted, const Ready& ready)
     {
         expected_ = &expected; // from now on slotFor() knows
         std::exception_ptr failure;
@@ -176,7 +176,8 @@ public:
             {
                 const std::lock_guard<std::mutex> lock(mutexOf(tile));
                 const auto& slot = slotOf(tile);
-                if ((inputs.empty() && !all && !isTouched(tile) && !hasSamples(tile)) || samples(tile).count == 0)
+                if ((inputs.empty() && traits().pixelOpIsPointwise && !isTouched(tile) && !hasSamples(tile))
+                    || samples(tile).count == 0)
                     continue;
                 try {
                     if (Slot& its = slotFor(tile); !its.declared)

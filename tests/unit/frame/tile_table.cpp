@@ -48,7 +48,10 @@ struct Stage final : dfb::detail::TileStage {
 };
 
 struct Operations final : dfb::detail::Operations {
-    explicit Operations(Fault at) : dfb::detail::Operations({}), fault(at) {}
+    explicit Operations(Fault at, const dfb::detail::OperationTraits& traits = {})
+        : dfb::detail::Operations(traits), fault(at)
+    {
+    }
     std::unique_ptr<dfb::detail::TileStage> makeTile() const override
     {
         ++made;
@@ -101,7 +104,7 @@ Seen frame(dfb::detail::TileTable& table, std::int64_t number, Time time)
     dfb::ErrorInfo where;
     try {
         table.declare(
-            expected, false, where,
+            expected, where,
             [&](int tile) {
                 if (tile == 0 && time == WhileDeclaring) { // the last tile is not counted yet
                     arrive(0);
@@ -144,7 +147,9 @@ TEST_CASE("An operation that has thrown gets no more inputs, and its tile ends o
 
 TEST_CASE("The operations of tiles that move away are used for those that come", "[tile_table]")
 {
-    Operations operations(None);
+    dfb::detail::OperationTraits traits;
+    traits.pixelOpIsPointwise = false; // so tiles without inputs are ready, too
+    Operations operations(None, traits);
     const dfb::TileLayout layout(256, 64, 64);
     dfb::detail::TileTable table(
         layout, [](int tile, const dfb::TileLayout&, int) { return tile / 2; }, 0, 2, operations);
@@ -164,7 +169,7 @@ TEST_CASE("The operations of tiles that move away are used for those that come",
         dfb::ErrorInfo where;
         int ready = 0;
         table.declare(
-            expected, true, where, [](int) {}, [&](int) { ++ready; });
+            expected, where, [](int) {}, [&](int) { ++ready; });
         CHECK(ready == 2);
         return haveMoved;
     };
