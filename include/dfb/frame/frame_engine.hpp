@@ -256,12 +256,10 @@ public:
     {
         if (renderNs_ >= 0)
             return;
-        if (params_.declared && !declarations_.declared() && !outcome_->failed()) {
-            const auto reason = open_.reason(); // why declare() was not called, in a frame that may be partial
-            outcome_->failWhole(reason ? *reason
-                                       : errorInfo(ErrorKind::InvalidArgument,
-                                                   "end() of a frame with declared inputs without declare()"));
-        }
+        // In a frame that may be partial, a reason says why declare() was not called.
+        if (params_.declared && !declarations_.declared() && !outcome_->failed())
+            outcome_->failWhole(open_.reason().value_or(
+                errorInfo(ErrorKind::InvalidArgument, "end() of a frame with declared inputs without declare()")));
         if (pipeline_->gather().displays())
             outcome_->guarded([this] { pipeline_->finishBackground(); });
         renderNs_ = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
