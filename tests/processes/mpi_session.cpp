@@ -10,7 +10,10 @@
 //   mpirun -n 3 mpi_session exception_frame   the same between two frames
 //   mpirun -n 3 mpi_session give_up      rank 1 cannot go on, and the others neither: the same
 // With a file as second argument, the last three append to it what each rank caught: a launcher may drop what a rank
-// prints just before its job ends. Returns 0 if all is well.
+// prints just before its job ends. They also append "stood still" if a rank did, so that others may not have waited for
+// it. Returns 0 if all is well.
+#include "undisturbed.hpp"
+
 #include <dfb/dfb.hpp>
 
 #include <chrono>
@@ -107,15 +110,20 @@ void wholeLife(int& argc, char**& argv, int level)
     check(has(after, "transport failure") && has(after, "finalised"), "a session after the end", after);
 }
 
+void append(const char* file, const std::string& line)
+{
+    if (std::FILE* out = file ? std::fopen(file, "a") : nullptr) {
+        std::fputs(line.c_str(), out);
+        std::fclose(out);
+    }
+}
+
 void sayCaught(const std::exception& e, const char* file)
 {
     const std::string line = std::string("caught: ") + e.what() + '\n';
     std::fputs(line.c_str(), stdout);
     std::fflush(stdout);
-    if (std::FILE* out = file ? std::fopen(file, "a") : nullptr) {
-        std::fputs(line.c_str(), out);
-        std::fclose(out);
-    }
+    append(file, line);
 }
 
 void emptyFrame(dfb::DistributedFrameBuffer<dfb::AlphaBlend>& fb)
@@ -193,6 +201,13 @@ int main(int argc, char** argv)
 {
     const std::string what = argc > 1 ? argv[1] : "multiple";
     const char* file = argc > 2 ? argv[2] : nullptr;
+    if (file) {
+        // Static, so that it also measures while an exit waits half a second for the other ranks.
+        static const StandStill standStill([file](StandStill::Clock::duration longest) {
+            if (longest >= std::chrono::milliseconds(100))
+                append(file, "stood still\n");
+        });
+    }
     if (what == "multiple" || what == "funneled") {
         wholeLife(argc, argv, what == "multiple" ? MPI_THREAD_MULTIPLE : MPI_THREAD_FUNNELED);
     } else if (what == "highest") {
