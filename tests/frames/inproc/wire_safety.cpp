@@ -202,7 +202,8 @@ Changed changed(MessageKind kind, std::uint32_t scope, int sender, const std::fu
     runOn(
         watched, 3,
         [&](const BoardTransport::Communicator& communicator) {
-            FrameBuffer<Blend> fb(communicator, configOf(s));
+            // Two threads could handle what is overtaken first. Without workers one handles all, in their order.
+            FrameBuffer<Blend> fb(communicator, configOf(s, overtaken ? 0 : 1));
             const auto frame = [&] {
                 return outcomeOf([&] {
                     const auto report = scene::renderLoop(fb, s, Loop::Declared);
