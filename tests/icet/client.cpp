@@ -2,8 +2,8 @@
 //   mpirun -n 3 test_icet_client errors      wrong calls, on one rank or on all
 //   mpirun -n 3 test_icet_client moves       tiles that change their size and rank from frame to frame
 //   mpirun -n 2 test_icet_client differs     ranks that have set different tiles
-//   mpirun -n 3 test_icet_client absent      a rank that does not call (DFB_ICET_TIMEOUT=1); first: not even once
-//   mpirun -n 3 test_icet_client stopped     a rank that hangs and continues later (DFB_ICET_TIMEOUT=1)
+//   mpirun -n 3 test_icet_client absent      a rank that does not call (DFB_ICET_TIMEOUT=4); first: not even once
+//   mpirun -n 3 test_icet_client stopped     a rank that hangs and continues later (DFB_ICET_TIMEOUT=4)
 //   mpirun -n 3 test_icet_client killed      a rank that dies; prints "all were told", then the launcher may end the
 //                                            job
 //   mpirun -n 2 test_icet_client finalised   a context that outlives MPI
@@ -368,7 +368,7 @@ void tryAbsence(bool isFirst)
         const auto before = std::chrono::steady_clock::now();
         expect(icetImageIsNull(Picture(40, 30).composite()), "a picture without one rank");
         expectError(ICET_INVALID_OPERATION, "a rank that does not call");
-        expect(std::chrono::steady_clock::now() - before < std::chrono::seconds(15), "it takes long");
+        expect(std::chrono::steady_clock::now() - before < std::chrono::seconds(25), "it takes long");
     }
     icetDestroyContext(context);
 }
@@ -391,7 +391,7 @@ void tryLoss(int signal, int launched)
         const auto before = std::chrono::steady_clock::now();
         expect(icetImageIsNull(Picture(40, 30).composite()), "a picture without the lost rank");
         expectError(ICET_INVALID_OPERATION, "a lost rank");
-        expect(std::chrono::steady_clock::now() - before < std::chrono::seconds(15), "it takes long");
+        expect(std::chrono::steady_clock::now() - before < std::chrono::seconds(25), "it takes long");
         MPI_Barrier(others);
     }
     if (signal == SIGKILL) { // MPI can no longer be finalised in order
