@@ -149,13 +149,13 @@ struct Expected {
 
 // `placeOf(rank)` is the rank's place in the order.
 template <class PlaceOf>
-Expected expectedAt(int x, int y, int ranks, dfb::ImageBlend blend, const Form& form, bool hasDepth,
+Expected expectedAt(int x, int y, int ranks, dfb::ImageBlend blend, bool hasStraightAlpha, bool hasDepth,
                     const PlaceOf& placeOf)
 {
     std::vector<std::tuple<double, int, Source>> layers;
     for (int rank = 0; rank < ranks; ++rank)
         if (isIn(validOf(rank), x, y)) {
-            const Source s = sourceAt(rank, x, y, form.hasStraightAlpha);
+            const Source s = sourceAt(rank, x, y, hasStraightAlpha);
             if (hasDepth && s.depth >= 1)
                 continue;
             const double key = blend == dfb::ImageBlend::InOrder ? placeOf(rank) : static_cast<double>(s.depth);
@@ -171,7 +171,7 @@ Expected expectedAt(int x, int y, int ranks, dfb::ImageBlend blend, const Form& 
     for (const auto& [key, rank, s] : layers) {
         const double alpha = s.levels[3] / 255.0;
         for (std::size_t c = 0; c < 4; ++c)
-            e.rgba[c] += through * s.levels[c] / 255.0 * (form.hasStraightAlpha && c < 3 ? alpha : 1.0);
+            e.rgba[c] += through * s.levels[c] / 255.0 * (hasStraightAlpha && c < 3 ? alpha : 1.0);
         through *= 1 - alpha;
         // By depth, a pixel with alpha 0 does not count, as its colours are 0, too. For the nearest, the depth alone
         // decides.
@@ -197,18 +197,23 @@ struct Images {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
         const auto executor = std::make_shared<dfb::ThreadExecutor>(2);
-        for (const auto blend : {dfb::ImageBlend::Nearest, dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder})
+        const int ranks = connection->size();
+        const auto placeOf = [&](int rank) { return (rank + 2) % ranks; };
+        for (const auto blend : {dfb::ImageBlend::Nearest, dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder}) {
+            const bool hasDepth = blend != dfb::ImageBlend::InOrder;
+            std::array<std::vector<Expected>, 2> expected; // with straight alpha: 1
+            for (int y = 0; y < imageHeight && connection->rank() == ranks - 1; ++y)
+                for (int x = 0; x < imageWidth; ++x)
+                    for (const bool isStraight : {false, true})
+                        expected[isStraight].push_back(expectedAt(x, y, ranks, blend, isStraight, hasDepth, placeOf));
             for (const bool toBytes : {true, false}) {
-                const bool hasDepth = blend != dfb::ImageBlend::InOrder;
                 dfb::FrameBufferConfig config(imageWidth, imageHeight,
                                               toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F,
                                               hasDepth && !toBytes);
                 config.executor = executor;
-                config.image.displayRank = connection->size() - 1;
+                config.image.displayRank = ranks - 1;
                 dfb::ImageCompositor compositor(connection, blend, config);
                 result.expect(compositor.image().empty(), "an image before the first");
-                const int ranks = compositor.size();
-                const auto placeOf = [&](int rank) { return (rank + 2) % ranks; };
                 for (const Form& form : forms)
                     for (const bool toBottomUp : {false, true}) {
                         compositor.setBottomUp(toBottomUp);
@@ -220,30 +225,33 @@ struct Images {
                             compositor.start(own.image, place, frame);
                         } // it is not needed any more
                         compositor.end();
-                        if (compositor.isDisplayRank())
-                            check(result, compositor.image(), form, blend, toBottomUp, hasDepth, ranks, placeOf);
+                        const auto checkImage = [&] {
+                            if (compositor.isDisplayRank())
+                                check(result, compositor.image(), expected[form.hasStraightAlpha], form, blend,
+                                      toBottomUp);
+                        };
+                        checkImage();
                         // Memory that stays unchanged: visible to this rank only, or to others as well.
                         OwnImage own(compositor.rank(), form, hasDepth);
                         for (const bool isShared : {false, true}) {
                             const dfb::Buffer memory = isShared ? own.moveTo(compositor) : dfb::Buffer();
                             compositor.composite(own.image, place, frame);
-                            if (compositor.isDisplayRank())
-                                check(result, compositor.image(), form, blend, toBottomUp, hasDepth, ranks, placeOf);
+                            checkImage();
                         }
                     }
             }
+        }
         return result;
     }
 
-    template <class PlaceOf>
-    static void check(Result& result, const dfb::Image& image, const Form& form, dfb::ImageBlend blend, bool toBottomUp,
-                      bool hasDepth, int ranks, const PlaceOf& placeOf)
+    static void check(Result& result, const dfb::Image& image, const std::vector<Expected>& expected, const Form& form,
+                      dfb::ImageBlend blend, bool toBottomUp)
     {
         int wrong = 0, wrongDepths = 0;
         const bool isFloat = image.format() == dfb::OutputFormat::RGBA32F;
         for (int y = 0; y < imageHeight; ++y)
             for (int x = 0; x < imageWidth; ++x) {
-                const Expected e = expectedAt(x, y, ranks, blend, form, hasDepth, placeOf);
+                const Expected& e = expected[static_cast<std::size_t>(y * imageWidth + x)];
                 const auto i = static_cast<std::size_t>((toBottomUp ? imageHeight - 1 - y : y) * imageWidth + x);
                 for (std::size_t c = 0; c < 4; ++c) {
                     // Colours are floats on the way: they are rounded by 2^-24 for each of 7 layers, and twice if they
