@@ -148,8 +148,8 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
         }
         const auto report =
             scene::renderLoop(fb, s, frame % 3 ? scene::Loop::Declared : scene::Loop::Listing3, frame % 4);
-        if (fb.isDisplayRank() && frame % 16 == 1
-            && wrongValues(scene::Picture(fb.image(), report), referenceOf(s)) > 0)
+        const auto expected = [&] { return referenceOf(s, [](auto&&...) {}); }; // which is not kept: see Holdings
+        if (fb.isDisplayRank() && frame % 16 == 1 && wrongValues(scene::Picture(fb.image(), report), expected()) > 0)
             wrong += "frame " + std::to_string(frame) + " is wrong\n";
     }
     return wrong;
