@@ -168,8 +168,9 @@ if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
 else()
   set(_early_suffix pch)
 endif()
-add_test(NAME compile_fail.dfb_early COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -DDFB_COMPILED -I${_include}
-  -x c++-header ${_early} -o ${_early}.${_early_suffix})
+add_test(NAME compile_fail.dfb_early
+  COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 ${DFB_QUICK_COMPILE} -DDFB_COMPILED -I${_include}
+    -x c++-header ${_early} -o ${_early}.${_early_suffix})
 set_tests_properties(compile_fail.dfb_early PROPERTIES LABELS compile_fail FIXTURES_SETUP dfb_early)
 
 function(_dfb_add_compile_fail file)
