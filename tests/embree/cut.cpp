@@ -192,19 +192,16 @@ example::RenderSettings settingsOf(int width, int height)
     return settings;
 }
 
-// The scene looks the same, cut into these numbers of bricks and rendered by these numbers of ranks.
+// The scene looks the same, cut into these numbers of bricks and rendered by fewer ranks or by more.
 void checkCuts(const Scene& scene, const example::RenderSettings& settings)
 {
     const Picture whole = render(scene, settings, {1, 1});
     checkSame(render(scene, settings, {3, 0}), whole); // not cut in either case
-    for (const int bricks : {2, 3, 5, 8}) {
+    for (const auto& [bricks, ranks] : {std::pair(2, 3), {3, 2}, {5, 4}, {8, 3}}) {
         INFO(bricks << " bricks");
         const Picture one = render(scene, settings, {1, bricks});
         checkNoSeams(one, whole);
-        for (const int ranks : {2, 3, 4}) {
-            INFO(ranks << " ranks");
-            checkSame(render(scene, settings, {ranks, bricks}), one);
-        }
+        checkSame(render(scene, settings, {ranks, bricks}), one);
     }
 }
 
@@ -257,7 +254,7 @@ TEST_CASE("Every camera sees the same scene, cut or whole", "[cut]")
             checkNoSeams(one, whole);
             if (bricks != 5)
                 continue;
-            for (const int ranks : {2, 3, 4, 7})
+            for (const int ranks : {3, 7})
                 checkSame(render(scene, settings, {ranks, bricks}), one);
         }
     }
@@ -277,7 +274,7 @@ TEST_CASE("Ambient occlusion and shadows are the same, cut or whole, and need th
         INFO(bricks << " bricks");
         const Picture one = render(scene, settings, {1, bricks});
         checkNoSeams(one, whole);
-        for (const int ranks : {2, 3, 4, 7})
+        for (const int ranks : {3, 7})
             checkSame(render(scene, settings, {ranks, bricks}), one);
     }
     Run without{1, 8};
@@ -686,13 +683,12 @@ TEST_CASE("The image does not depend on who renders a brick, who owns a tile, an
     run.rankOf = [](int brick, int, int ranks) { return 1 + (4 * brick + 2) % (ranks - 1); };
     checkSame(render(scene, settings, run), one);
     run.rankOf = example::rankOfBrick;
+    run.threads = 0;
     for (const dfb::OwnerMap& map :
          {dfb::OwnerMap(dfb::linearOwner), dfb::OwnerMap(dfb::hashOwner), dfb::OwnerMap([](auto&&...) { return 2; })}) {
         run.ownerMap = map;
-        for (const int threads : {1, 2, 3}) {
-            run.threads = threads;
-            checkSame(render(scene, settings, run), one);
-        }
+        ++run.threads;
+        checkSame(render(scene, settings, run), one);
     }
     Run many{14, 2}; // more ranks than tiles and than bricks
     checkSame(render(scene, settings, many), render(scene, settings, {1, 2}));
