@@ -35,13 +35,6 @@ inline std::uint32_t bitsOf(float value) noexcept
     return bits;
 }
 
-// `condition` ? a : b. Uses masks, as compilers do not vectorize a choice between values made of floats.
-inline std::uint32_t choose(bool condition, std::uint32_t a, std::uint32_t b) noexcept
-{
-    const std::uint32_t mask = 0u - static_cast<std::uint32_t>(condition);
-    return (a & mask) | (b & ~mask);
-}
-
 // Converts a number from 0 to 65504 to the nearest binary16, ties to even.
 inline std::uint16_t positiveToHalf(float value) noexcept
 {
@@ -49,7 +42,9 @@ inline std::uint16_t positiveToHalf(float value) noexcept
     // of the mantissa.
     const std::uint32_t bits = bitsOf(value), small = bitsOf(value + 0.5f) - 0x3f000000u;
     const std::uint32_t normal = (bits + 0xc8000fffu + (bits >> 13 & 1u)) >> 13;
-    return static_cast<std::uint16_t>(choose(static_cast<std::int32_t>(bits) < 0x38800000, small, normal));
+    // A mask, as compilers do not vectorize a choice between values made of floats.
+    const std::uint32_t isSmall = 0u - static_cast<std::uint32_t>(static_cast<std::int32_t>(bits) < 0x38800000);
+    return static_cast<std::uint16_t>((small & isSmall) | (normal & ~isSmall));
 }
 inline float positiveFromHalf(std::uint16_t half) noexcept { return floatOf((half & 0x7fffu) << 13) * 0x1p112f; }
 
@@ -148,14 +143,12 @@ DFB_AVX2 inline __m256 wireVector(float color, float alpha) noexcept
 {
     return _mm256_setr_ps(color, color, color, alpha, color, color, color, alpha);
 }
-#endif
 
 template <class Code>
 DFB_AVX2 inline void encodePixelsAvx2(const float* rgba, int count, const WireScales& by, std::byte* out) noexcept
 {
     constexpr std::size_t wordBytes = sizeof(typename Code::Word);
     int i = 0;
-#if defined(DFB_HAS_AVX2_CLONES)
     const __m256 scales = wireVector(by.color, by.alpha), zero = _mm256_setzero_ps();
     for (; i + 8 <= count; i += 8) {
         __m256 scaled[4];
@@ -180,7 +173,6 @@ DFB_AVX2 inline void encodePixelsAvx2(const float* rgba, int count, const WireSc
             }
         }
     }
-#endif
     encodePixels<Code>(rgba + 4 * i, count - i, by, out + 4 * wordBytes * static_cast<std::size_t>(i));
 }
 
@@ -190,7 +182,6 @@ DFB_AVX2 inline bool decodePixelsAvx2(const std::byte* in, int count, const Wire
     constexpr std::size_t wordBytes = sizeof(typename Code::Word);
     int i = 0;
     bool inRange = true;
-#if defined(DFB_HAS_AVX2_CLONES)
     const __m256 scales = wireVector(by.color, by.alpha), least = wireVector(0, by.leastAlpha);
     if constexpr (std::is_same_v<Code, HalfCode>) {
         __m128i largest[2] = {};
@@ -211,14 +202,12 @@ DFB_AVX2 inline bool decodePixelsAvx2(const std::byte* in, int count, const Wire
             _mm256_storeu_ps(rgba + 4 * i, _mm256_max_ps(_mm256_mul_ps(_mm256_cvtepi32_ps(codes), scales), least));
         }
     }
-#endif
     return decodePixels<Code>(in + 4 * wordBytes * static_cast<std::size_t>(i), count - i, by, rgba + 4 * i) && inRange;
 }
 
 DFB_AVX2 inline bool arePixelsInRangeAvx2(const float* rgba, int count, float maxColor) noexcept
 {
-    int i = 0, inRange = 0xff; // a bit for each lane
-#if defined(DFB_HAS_AVX2_CLONES)
+    int i = 0;
     const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), most = _mm256_set1_ps(maxColor);
     __m256 in = _mm256_castsi256_ps(_mm256_set1_epi32(-1));
     for (; i + 2 <= count; i += 2) {
@@ -227,10 +216,9 @@ DFB_AVX2 inline bool arePixelsInRangeAvx2(const float* rgba, int count, float ma
         in = _mm256_and_ps(in, _mm256_and_ps(_mm256_cmp_ps(value, zero, _CMP_GE_OQ),
                                              _mm256_cmp_ps(value, limit, _CMP_LE_OQ))); // false for NaN
     }
-    inRange = _mm256_movemask_ps(in);
-#endif
-    return inRange == 0xff && arePixelsInRange(rgba + 4 * i, count - i, maxColor);
+    return _mm256_movemask_ps(in) == 0xff && arePixelsInRange(rgba + 4 * i, count - i, maxColor);
 }
+#endif
 
 // ---- active pixels, and copies that check them
 
@@ -278,6 +266,19 @@ struct Avx2ColorCheck {
     }
     DFB_AVX2 DFB_INLINE bool isGood() const { return _mm256_movemask_ps(areInside) == 255; }
 };
+
+DFB_AVX2 inline bool copyAndCheckColorsAvx2(const float* rgba, int count, float* out)
+{
+    Avx2ColorCheck check;
+    check.clear();
+    int i = 0;
+    for (; i + 2 <= count; i += 2) {
+        const __m256 two = _mm256_loadu_ps(rgba + 4 * i);
+        _mm256_storeu_ps(out + 4 * i, two);
+        check.add(two);
+    }
+    return (i == count || copyAndCheckColors(rgba + 4 * i, count - i, out + 4 * i)) && check.isGood();
+}
 
 // With `Copies`, also does what copyAndCheckColors() does, and sets `isGood` to false where that would return false.
 template <bool Copies>
@@ -416,24 +417,6 @@ inline bool hasNan(const float* depth, std::size_t count)
     for (std::size_t i = 0; i < count; i += 64)
         nan |= depthBits(depth + i, static_cast<int>(std::min<std::size_t>(64, count - i)), 0).nan;
     return nan != 0;
-}
-
-DFB_AVX2 inline bool copyAndCheckColorsAvx2(const float* rgba, int count, float* out)
-{
-    int i = 0;
-    bool areGood = true;
-#if defined(DFB_HAS_AVX2_CLONES)
-    Avx2ColorCheck check;
-    check.clear();
-    for (; i + 2 <= count; i += 2) {
-        const __m256 two = _mm256_loadu_ps(rgba + 4 * i);
-        _mm256_storeu_ps(out + 4 * i, two);
-        check.add(two);
-    }
-    areGood = check.isGood();
-#endif
-    const bool isRestGood = i == count || copyAndCheckColors(rgba + 4 * i, count - i, out + 4 * i);
-    return isRestGood && areGood;
 }
 
 // A depth as it travels: NaN becomes +infinity, and -0 becomes 0, so that plain comparisons order depths.

@@ -409,10 +409,8 @@ int wrongEncoded(const std::vector<float>& values)
         const std::size_t bytes = 4 * sizeof(Word) * static_cast<std::size_t>(count);
         std::vector<std::byte> fast(bytes + offset + 64, std::byte{0xa5}), plain(fast);
         encodePixels<Code>(values.data() + first, count, one, plain.data() + offset);
-        if (cpuHasAvx2())
-            encodePixelsAvx2<Code>(values.data() + first, count, one, fast.data() + offset);
-        else
-            encodePixels<Code>(values.data() + first, count, one, fast.data() + offset);
+        DFB_FASTEST(encodePixels<Code>, encodePixelsAvx2<Code>, values.data() + first, count, one,
+                    fast.data() + offset);
         wrong += fast != plain;
         for (std::size_t i = 0; i < 4 * static_cast<std::size_t>(count); ++i) {
             Word word = 0;
@@ -444,8 +442,8 @@ int wrongDecoded(std::size_t count)
     const auto check = [&](std::size_t first, int pixels) { // begins within a word, which must work as well
         std::vector<float> fast(4 * static_cast<std::size_t>(pixels) + 8, -7), plain(fast);
         const bool plainIn = decodePixels<Code>(bytes.data() + first, pixels, by, plain.data());
-        const bool fastIn = cpuHasAvx2() ? decodePixelsAvx2<Code>(bytes.data() + first, pixels, by, fast.data())
-                                         : decodePixels<Code>(bytes.data() + first, pixels, by, fast.data());
+        const bool fastIn =
+            DFB_FASTEST(decodePixels<Code>, decodePixelsAvx2<Code>, bytes.data() + first, pixels, by, fast.data());
         bool isIn = true;
         wrong += std::memcmp(fast.data(), plain.data(), fast.size() * sizeof(float)) != 0;
         wrong += std::count(plain.end() - 8, plain.end(), -7.0f) != 8;
@@ -488,11 +486,10 @@ TEST_CASE("Each channel has its scale", "[wire_codes]")
     std::vector<std::uint8_t> codes(rgba.size());
     encodePixels<Unorm8Code>(rgba.data(), 19, by, reinterpret_cast<std::byte*>(codes.data()));
     CHECK(codes == expected);
-    if (cpuHasAvx2()) {
-        codes.assign(codes.size(), 0);
-        encodePixelsAvx2<Unorm8Code>(rgba.data(), 19, by, reinterpret_cast<std::byte*>(codes.data()));
-        CHECK(codes == expected);
-    }
+    codes.assign(codes.size(), 0);
+    DFB_FASTEST(encodePixels<Unorm8Code>, encodePixelsAvx2<Unorm8Code>, rgba.data(), 19, by,
+                reinterpret_cast<std::byte*>(codes.data()));
+    CHECK(codes == expected);
 }
 
 TEST_CASE("Rows of codes are decoded as codes alone are, all of them", "[wire_codes]")
@@ -515,7 +512,7 @@ TEST_CASE("A pixel out of range is seen wherever it is", "[wire_codes]")
                 for (int i = 0; i < 4 * width; ++i)
                     rgba[i] = i % 4 == 3 ? 1.0f : maxColor * static_cast<float>(random() >> 8) * 0x1p-24f;
                 wrong += !arePixelsInRange(rgba, width, maxColor);
-                wrong += cpuHasAvx2() && !arePixelsInRangeAvx2(rgba, width, maxColor);
+                wrong += !DFB_FASTEST(arePixelsInRange, arePixelsInRangeAvx2, rgba, width, maxColor);
                 const std::size_t pixel = random() % static_cast<unsigned>(width), channel = random() % 4;
                 float* at = rgba + 4 * pixel;
                 const float alphas[] = {1.0f, 0.5f, 0x1p-149f, 0.0f, -0.0f};
@@ -536,7 +533,7 @@ TEST_CASE("A pixel out of range is seen wherever it is", "[wire_codes]")
                 for (int c = 0; c < 3; ++c)
                     expected = expected && at[c] >= 0 && at[c] <= maxColor * at[3];
                 wrong += arePixelsInRange(rgba, width, maxColor) != expected;
-                wrong += cpuHasAvx2() && arePixelsInRangeAvx2(rgba, width, maxColor) != expected;
+                wrong += DFB_FASTEST(arePixelsInRange, arePixelsInRangeAvx2, rgba, width, maxColor) != expected;
             }
     CHECK(wrong == 0);
 }
