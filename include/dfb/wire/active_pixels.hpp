@@ -248,14 +248,10 @@ DFB_COMPILED_ONCE void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults
     row.active.clear();
     if (y < valid.y0 || y >= valid.y1)
         return;
-    const std::ptrdiff_t begin = y * stride;
     const int ahead = rowAhead(y, valid.y1, valid.width());
     const auto most = static_cast<std::size_t>(valid.width());
     row.color.resize(std::max(row.color.size(), 4 * most));
     row.depth.resize(std::max(row.depth.size(), depth ? most : 0));
-    ConstPlanes planes;
-    planes.at[Color] = color;
-    planes.at[Depth] = reinterpret_cast<const std::byte*>(depth);
     // A row below a full one is likely to be full, so its colours are copied while active ones are searched.
     const bool copiesAll = row.isFull && activity.byColorAlone();
     bool areAllClean = true;
@@ -269,18 +265,19 @@ DFB_COMPILED_ONCE void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults
     };
     std::size_t done = 0;
     row.active.findRow(y, valid.x0, valid.x1, bitsOf, [&](Span span) {
-        const std::ptrdiff_t first = begin + span.x;
+        const RowPlace from = at(span.x, y);
         float *toColor = row.color.data() + 4 * done, *toDepth = depth ? row.depth.data() + done : nullptr;
         row.isFull = span.count == valid.width();
         bool isClean = areAllClean;
         if (activity.hasBytes)
-            bytesToFloats(color + 4 * first, span.count, toColor);
+            bytesToFloats(from.color, span.count, toColor);
         else if (!copiesAll || !row.isFull)
-            isClean = copyAndCheck(planes, false, Color, first, span.count, reinterpret_cast<std::byte*>(toColor));
+            isClean =
+                DFB_FASTEST(copyAndCheckColors, copyAndCheckColorsAvx2, floatsOf(from.color), span.count, toColor);
         if (depth)
-            isClean &= copyAndCheck(planes, false, Depth, first, span.count, reinterpret_cast<std::byte*>(toDepth));
+            isClean &= fastest<copyAndCheckDepths>(from.depth, static_cast<int>(span.count), toDepth);
         if (!isClean)
-            countFaults(toColor, depth ? depth + first : nullptr, span.count, faults);
+            countFaults(toColor, from.depth, span.count, faults);
         done += span.count;
     });
 }

@@ -315,8 +315,9 @@ public:
         find(tile, byDepth, [&](std::ptrdiff_t first, int count) {
             for (std::size_t i = 0; i < targetCount; ++i) {
                 const auto [channel, to] = targets[i];
-                isClean &= copyAndCheck(planes, tile.hasBytes, channel, first, count, to);
-                targets[i].to += tile.pixelBytes(channel) * static_cast<std::size_t>(count);
+                const auto bytes = static_cast<std::ptrdiff_t>(tile.pixelBytes(channel));
+                isClean &= copyAndCheck(channel, bytes, planes.at[channel] + bytes * first, count, to);
+                targets[i].to += bytes * count;
             }
         });
         isClean_ = isClean;

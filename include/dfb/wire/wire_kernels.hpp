@@ -437,26 +437,15 @@ DFB_INLINE bool copyAndCheckDepths(const float* depth, int count, float* out)
     return isNan == 0;
 }
 
-// Copies `count` pixels of a channel, from pixel `first` of its plane on, in the form in which they travel. `hasBytes`:
-// the colour has 8 bits a channel. Returns false if a colour is not finite, an alpha is not within [0, 1], or a depth
-// is NaN.
-inline bool copyAndCheck(const ConstPlanes& planes, bool hasBytes, std::size_t channel, std::ptrdiff_t first, int count,
-                         std::byte* out)
+// Copies `count` pixels of a channel, of `pixelBytes` bytes each, in the form in which they travel. Returns false if a
+// colour in floats is not finite, an alpha of these is not within [0, 1], or a depth is NaN.
+inline bool copyAndCheck(std::size_t channel, std::ptrdiff_t pixelBytes, const std::byte* in, int count, std::byte* out)
 {
-    if (channel == Color && hasBytes) {
-        std::memcpy(out, planes.at[Color] + 4 * first, 4 * static_cast<std::size_t>(count));
-        return true;
-    }
-    if (channel == Color) {
-        const float* rgba = floatsOf(planes.at[Color]) + 4 * first;
-        return DFB_FASTEST(copyAndCheckColors, copyAndCheckColorsAvx2, rgba, count, floatsOf(out));
-    }
-    if (channel == Depth) {
-        const float* depth = floatsOf(planes.at[Depth]) + first;
-        return fastest<copyAndCheckDepths>(depth, count, floatsOf(out));
-    }
-    const auto bytes = static_cast<std::ptrdiff_t>(4 * channelWords[channel]);
-    std::memcpy(out, planes.at[channel] + bytes * first, static_cast<std::size_t>(bytes * count));
+    if (channel == Color && pixelBytes > 4)
+        return DFB_FASTEST(copyAndCheckColors, copyAndCheckColorsAvx2, floatsOf(in), count, floatsOf(out));
+    if (channel == Depth)
+        return fastest<copyAndCheckDepths>(floatsOf(in), count, floatsOf(out));
+    std::memcpy(out, in, static_cast<std::size_t>(pixelBytes * count));
     return true;
 }
 
