@@ -292,7 +292,6 @@ public:
     ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, std::byte* colors,
                        float* depths = nullptr)
     {
-        const ConstPlanes& planes = tile.planes;
         const auto most =
             static_cast<std::size_t>(tile.region.width()) * static_cast<std::size_t>(tile.region.height());
         struct Target {
@@ -311,15 +310,28 @@ public:
                 targets[targetCount++] = {c, to};
                 result.at[c] = to;
             }
+        clear();
+        nanDepths_ = 0;
         bool isClean = true;
-        find(tile, byDepth, [&](std::ptrdiff_t first, int count) {
-            for (std::size_t i = 0; i < targetCount; ++i) {
-                const auto [channel, to] = targets[i];
-                const auto bytes = static_cast<std::ptrdiff_t>(tile.pixelBytes(channel));
-                isClean &= copyAndCheck(channel, bytes, planes.at[channel] + bytes * first, count, to);
-                targets[i].to += bytes * count;
-            }
-        });
+        const PixelsInPlace its = pixelsInPlace(tile, depthChannel, byDepth);
+        const Region& valid = its.valid;
+        const int yEnd = its.color && valid.width() > 0 ? valid.y1 : 0;
+        for (int y = valid.y0; y < yEnd; ++y) {
+            const int ahead = rowAhead(y, yEnd, valid.width());
+            const auto bitsOf = [&](int x, int count) {
+                return its.activity.bits(its.at(x, y), its.at(x, ahead), count, nanDepths_);
+            };
+            findRow(y, valid.x0, valid.x1, bitsOf, [&](Span span) {
+                const std::ptrdiff_t first = y * tile.stride + span.x;
+                for (std::size_t i = 0; i < targetCount; ++i) {
+                    const auto [channel, to] = targets[i];
+                    const auto bytes = static_cast<std::ptrdiff_t>(tile.pixelBytes(channel));
+                    isClean &= copyAndCheck(channel, bytes, tile.planes.at[channel] + bytes * first, span.count, to);
+                    targets[i].to += bytes * span.count;
+                }
+            });
+        }
+        endRows();
         isClean_ = isClean;
         return result;
     }
@@ -329,25 +341,6 @@ public:
     std::uint64_t nanDepths() const noexcept { return nanDepths_; }
 
 private:
-    // Calls f(first, count) for each span as it is found. `first` is the index of its first pixel in the planes.
-    template <class F>
-    void find(const InputPixels& tile, bool byDepth, const F& f)
-    {
-        clear();
-        nanDepths_ = 0;
-        const PixelsInPlace its = pixelsInPlace(tile, depthChannel, byDepth);
-        const Region& valid = its.valid;
-        const int yEnd = its.color && valid.width() > 0 ? valid.y1 : 0;
-        for (int y = valid.y0; y < yEnd; ++y) {
-            const int ahead = rowAhead(y, yEnd, valid.width());
-            findRow(
-                y, valid.x0, valid.x1,
-                [&](int x, int count) { return its.activity.bits(its.at(x, y), its.at(x, ahead), count, nanDepths_); },
-                [&](Span span) { f(y * tile.stride + span.x, static_cast<int>(span.count)); });
-        }
-        endRows();
-    }
-
     std::array<std::vector<float>, channelCount> planes_; // words of 4 bytes; ids are copied bit for bit
     bool isClean_ = true;
     std::uint64_t nanDepths_ = 0;
