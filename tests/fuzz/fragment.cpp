@@ -298,9 +298,8 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         tile.planes.at[d::Depth] = begin + 4 * first;
         tile.stride = stride;
         tile.hasBytes = hasBytes;
-        const dfb::Buffer message =
-            d::encodeInPlace(*pool, tile, d::pixelsInPlace(tile, colorAndDepth, false), colorAndDepth, 0,
-                             [&](const std::byte* p) { return static_cast<std::int64_t>(p - begin); });
+        const dfb::Buffer message = d::encodeInPlace(
+            *pool, tile, colorAndDepth, 0, [&](const std::byte* p) { return static_cast<std::int64_t>(p - begin); });
         const std::size_t prefix = sizeof(d::MessageHeader);
         const std::string body = fuzz::textOf(message.data() + prefix, message.size() - prefix);
         all.emplace_back(name, fuzz::Output().put(std::uint8_t{0}).text(body).bytes());

@@ -207,7 +207,7 @@ public:
     template <class OffsetOf>
     Buffer encodePlace(const InputPixels& tile, const OffsetOf& offsetOf)
     {
-        return encodeInPlace(*pool_, tile, inPlace(tile), sent_ | colorChannel, address_, offsetOf);
+        return encodeInPlace(*pool_, tile, sent_ | colorChannel, address_, offsetOf);
     }
 
     // Returns the input for such a tile if this rank owns it.
@@ -217,7 +217,7 @@ public:
         parts.encoding = FragmentEncoding::InPlace;
         parts.channels = static_cast<ChannelMask>(sent_ | colorChannel);
         parts.colorFormat = tile.hasBytes ? WireFormat::Bytes : WireFormat::Float32;
-        parts.inPlace = inPlace(tile);
+        parts.inPlace = pixelsInPlace(tile, sent_, traits().activeByDepth);
         parts.faults = &faults_;
         TileHeader header = tile;
         header.sample = 0; // as in an input that comes in a message
@@ -407,7 +407,6 @@ private:
     }
 
     bool readsInPlace() const { return traits().readsInPlace && !traits().keepsState && !isLossy(); }
-    PixelsInPlace inPlace(const InputPixels& tile) const { return pixelsInPlace(tile, sent_, traits().activeByDepth); }
 
     bool isLossy() const noexcept
     {

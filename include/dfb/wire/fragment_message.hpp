@@ -228,9 +228,10 @@ inline ByteRange bytesOfPlane(std::int64_t first, std::int64_t stride, const Reg
 // Makes the message for a tile whose pixels the owner reads where they lie. `offsetOf(address)`: the offset from the
 // start of the shared memory, or -1. Returns an empty buffer if the pixels do not lie in the shared memory.
 template <class OffsetOf>
-Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, const PixelsInPlace& pixels, ChannelMask channels,
-                     std::uint32_t receiver, const OffsetOf& offsetOf)
+Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, ChannelMask channels, std::uint32_t receiver,
+                     const OffsetOf& offsetOf)
 {
+    const PixelsInPlace pixels = pixelsInPlace(tile, channels, false); // the owner knows whether they are by depth
     // Returns the offset of a plane's first pixel, or -1 unless all of the plane's valid pixels are in the shared
     // memory.
     const auto placeOf = [&](const std::byte* plane, std::int64_t pixelBytes) -> std::int64_t {

@@ -497,11 +497,10 @@ TEST_CASE("Pixels of 8 bits may lie at any address, floats at a multiple of 4 on
             d::InputPixels pixels(*tile);
             pixels.hasBytes = hasBytes;
             pixels.planes.at[d::Color] = shared.data();
-            const auto inPlace = d::pixelsInPlace(pixels, dfb::colorChannel, false);
             const auto offsetOf = [&](const std::byte* p) -> std::int64_t { return first + (p - shared.data()); };
             const auto decode = [&] {
                 d::decodeFragment(
-                    *pool, d::encodeInPlace(*pool, pixels, inPlace, dfb::colorChannel, 0, offsetOf), layout,
+                    *pool, d::encodeInPlace(*pool, pixels, dfb::colorChannel, 0, offsetOf), layout,
                     [](int) { return 3; }, nullptr, d::WireCoder(), bytesAt);
             };
             INFO((hasBytes ? "bytes at " : "floats at ") << first);
