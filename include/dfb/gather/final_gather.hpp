@@ -269,7 +269,7 @@ public:
         bool isLast = false;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            isLast = --batch->writers == 0 && batch->closed;
+            isLast = --batch->writers == 0 && batch != batch_;
         }
         if (isLast)
             sendBatch(std::move(batch));
@@ -458,7 +458,6 @@ private:
         Buffer message;
         std::size_t used = 0;
         int writers = 0;
-        bool closed = false;
     };
     struct BatchHeader {
         std::uint64_t rawBytes = 0, codec = 0; // no codec: 0
@@ -578,7 +577,6 @@ private:
     // Under mutex_. Returns the batch to be sent, or null if somebody still writes to it: the last writer sends it.
     std::shared_ptr<Batch> closeBatch()
     {
-        batch_->closed = true;
         std::shared_ptr<Batch> closed = std::move(batch_);
         return closed->writers == 0 ? std::move(closed) : nullptr;
     }
