@@ -110,7 +110,10 @@ public:
 
     void put(const PixelTile& tile)
     {
-        noteFrame(tile.frame);
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            newest_ = std::max(newest_, tile.frame);
+        }
         const std::size_t pixelBytes = bytesPerPixel(format_);
         const auto tileWidth = static_cast<std::size_t>(tile.region.width());
         for (int d = 0; d < layout_.displayCount(); ++d) {
@@ -129,7 +132,9 @@ public:
                 convertPixels(tile.color + 4 * first, part.width(), format_, out);
             }
             mailbox_->send(layout_.ranks[static_cast<std::size_t>(d)], std::move(message));
-            countSent(tile.frame, d, static_cast<std::int64_t>(part.width()) * part.height());
+            const std::lock_guard<std::mutex> lock(mutex_);
+            countsOf(sent_, tile.frame)[static_cast<std::size_t>(d)] +=
+                static_cast<std::int64_t>(part.width()) * part.height();
         }
     }
 
@@ -209,23 +214,18 @@ private:
 
     void incoming(int source, const MessageHeader& header, Buffer&& message) override
     {
-        const std::size_t byteCount = message.size();
         if (source != mailbox_->rank() && mailbox_->needsCredit(header.kind))
-            mailbox_->consumed(source, byteCount);
+            mailbox_->consumed(source, message.size());
         try {
             if (mailbox_->receiveCredit(source, header, message))
                 return;
-            switch (header.kind) {
-            case MessageKind::FinishedTiles: store(header.number, message); break;
-            case MessageKind::ReduceUp:
-            case MessageKind::ReduceDown:
-                if (mailbox_->scopeOf(message) == SentPixels) {
-                    receiveSent(source, header, message);
-                    break;
-                }
-                [[fallthrough]];
-            default: failMalformed("a message of a kind that no wall gets", -1, static_cast<std::int64_t>(header.kind));
-            }
+            const bool isReduction = header.kind == MessageKind::ReduceUp || header.kind == MessageKind::ReduceDown;
+            if (header.kind == MessageKind::FinishedTiles)
+                store(header.number, message);
+            else if (isReduction && mailbox_->scopeOf(message) == SentPixels)
+                receiveSent(source, header, message);
+            else
+                failMalformed("a message of a kind that no wall gets", -1, static_cast<std::int64_t>(header.kind));
         } catch (const Error& e) {
             if (header.kind == MessageKind::FinishedTiles)
                 refuse(source, e.info(), header.number);
@@ -319,13 +319,6 @@ private:
     // Under mutex_.
     std::int64_t lastPossible() const { return std::max(last_, newest_) + framesAhead; }
 
-    // Notes that this rank has begun a frame.
-    void noteFrame(std::int64_t frame)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        newest_ = std::max(newest_, frame);
-    }
-
     // The pictures of all displays of this rank; under mutex_.
     std::shared_ptr<Pictures> picturesOf(std::int64_t frame)
     {
@@ -341,23 +334,24 @@ private:
 
     // ---- how many pixels of a frame all ranks have sent to each display
 
-    void countSent(std::int64_t frame, int display, std::int64_t pixels)
+    using Counts = std::vector<std::int64_t>; // of pixels, by display
+
+    // Under mutex_.
+    Counts& countsOf(std::map<std::int64_t, Counts>& frames, std::int64_t frame) const
     {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        auto& sent = sent_[frame];
-        sent.resize(static_cast<std::size_t>(layout_.displayCount()));
-        sent[static_cast<std::size_t>(display)] += pixels;
+        Counts& counts = frames[frame];
+        counts.resize(static_cast<std::size_t>(layout_.displayCount()));
+        return counts;
     }
 
     // Called when this rank has sent all of its frame: tells the other ranks how much that was. Waits for nothing.
     void tellSent(std::int64_t frame)
     {
-        std::vector<std::int64_t> mine;
+        Counts mine;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            mine = sent_[frame];
+            mine = countsOf(sent_, frame);
         }
-        mine.resize(static_cast<std::size_t>(layout_.displayCount()));
         const auto* first = reinterpret_cast<const std::byte*>(mine.data());
         mailbox_->reductions().enter(
             {SentPixels, frame}, Bytes(first, first + mine.size() * sizeof mine[0]),
@@ -373,9 +367,7 @@ private:
                     const std::lock_guard<std::mutex> lock(mutex_);
                     if (frame <= last_)
                         return;
-                    auto& sent = allSent_[frame];
-                    sent.resize(static_cast<std::size_t>(layout_.displayCount()));
-                    std::copy(all.begin(), all.end(), reinterpret_cast<std::byte*>(sent.data()));
+                    std::copy(all.begin(), all.end(), reinterpret_cast<std::byte*>(countsOf(allSent_, frame).data()));
                 }
                 mailbox_->notify();
             });
@@ -450,9 +442,9 @@ private:
     std::int64_t shownFrame_ = -1;
 
     std::mutex mutex_;
-    std::map<std::int64_t, std::shared_ptr<Pictures>> coming_;         // by frame; under mutex_, except the pixels
-    std::map<std::int64_t, std::vector<std::int64_t>> sent_, allSent_; // pixels by frame and display; under mutex_
-    std::int64_t last_ = 0;                                            // the last finished frame; under mutex_
+    std::map<std::int64_t, std::shared_ptr<Pictures>> coming_; // by frame; under mutex_, except the pixels
+    std::map<std::int64_t, Counts> sent_, allSent_;            // by frame; under mutex_
+    std::int64_t last_ = 0;                                    // the last finished frame; under mutex_
     std::int64_t dropped_ = 0;    // the newest frame dropped for want of room; under mutex_
     std::int64_t newest_ = 0;     // the newest frame that this rank has begun; under mutex_
     std::string error_;           // under mutex_
