@@ -84,14 +84,7 @@ namespace detail {
 
 inline std::size_t bytesOf(WireFormat format) noexcept
 {
-    switch (format) {
-    case WireFormat::Float32: return 4;
-    case WireFormat::Float16:
-    case WireFormat::Unorm16: return 2;
-    case WireFormat::Unorm8:
-    case WireFormat::Bytes: break;
-    }
-    return 1;
+    return format == WireFormat::Float32 ? 4 : format == WireFormat::Float16 || format == WireFormat::Unorm16 ? 2 : 1;
 }
 
 // Converts `count` pixels with 8 bits a channel: level / 255, rounded once.
