@@ -82,7 +82,7 @@ std::string recordOf(const FinishedRecord& record, int tile, const d::FinishedPl
 {
     static FinishedRecord::Plan plan;
     record.plan(tile, layout().region(tile), planes, splits, plan);
-    dfb::Buffer bytes = fuzz::ExactBlocks::copyOf(std::string(plan.bytes(), '\x55'));
+    dfb::Buffer bytes = fuzz::ExactBlocks::copyOf(std::string(plan.bytes, '\x55'));
     record.write(plan, bytes.data());
     return fuzz::textOf(bytes.data(), bytes.size());
 }

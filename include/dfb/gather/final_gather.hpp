@@ -245,10 +245,10 @@ public:
             const std::lock_guard<std::mutex> lock(mutex_);
             if (flushed_)
                 return false;
-            const bool isFull = batch_ && batch_->used + plan.bytes() > batch_->message.size();
+            const bool isFull = batch_ && batch_->used + plan.bytes > batch_->message.size();
             Buffer memory; // first, as it may throw
             if (!batch_ || isFull)
-                memory = pool_->acquire(std::max(batchBytes, prefix + plan.bytes()));
+                memory = pool_->acquire(std::max(batchBytes, prefix + plan.bytes));
             if (isFull)
                 full = closeBatch();
             if (!batch_) {
@@ -259,7 +259,7 @@ public:
             }
             batch = batch_;
             record = batch->message.data() + batch->used;
-            batch->used += plan.bytes();
+            batch->used += plan.bytes;
             ++batch->writers;
             ++sent_.tiles;
         }

@@ -26,7 +26,7 @@ struct FinishedPlanes {
 };
 
 // Makes and reads the records of finished tiles for one format and one set of channels.
-class FinishedRecord {
+class FinishedRecord : public PlaneFormat {
 public:
     struct Header {
         std::int32_t tile = 0;
@@ -36,51 +36,41 @@ public:
 
     // `channels`: those beside the colour.
     FinishedRecord(OutputFormat format, ChannelMask channels)
-        : format_(static_cast<ChannelMask>(channels | colorChannel), bytesPerPixel(format) / 4)
+        : PlaneFormat(static_cast<ChannelMask>(channels | colorChannel), bytesPerPixel(format) / 4)
     {
     }
 
-    // Bytes of a pixel in a channel; 0 if the image does not have the channel.
-    std::size_t pixelBytes(std::size_t channel) const noexcept { return format_.pixelBytes(channel); }
-    std::size_t pixelBytes() const noexcept { return format_.pixelBytes(); } // in all channels
-    // The planes of `pixels` pixels in memory that begins at `first`.
-    Planes planesAt(std::byte* first, std::size_t pixels) const { return format_.planesAt(first, pixels); }
     // The largest size of a record with so many pixels.
     std::size_t mostBytes(std::size_t pixels) const { return alignedTo16(sizeof(Header) + pixelBytes() * pixels); }
 
     // The parts of a tile that are to be written, found by one pass over it. Reuse it from tile to tile, as it keeps
     // its memory.
-    class Plan {
-    public:
-        std::size_t bytes() const noexcept { return bytes_; }
-
-    private:
-        friend class FinishedRecord;
-        Header header_;
-        FinishedPlanes from_;
-        std::size_t filler_ = 0; // index of the filler pixel
-        std::size_t bytes_ = 0;
-        ActiveSpans active_; // the pixels that differ from the filler
-        std::vector<std::byte> body_;
+    struct Plan {
+        std::size_t bytes = 0; // of the record
+        Header header;
+        FinishedPlanes from;
+        std::size_t filler = 0; // index of the filler pixel
+        ActiveSpans active;     // the pixels that differ from the filler
+        std::vector<std::byte> body;
     };
 
     void plan(int tile, const Region& region, const FinishedPlanes& from, bool splits, Plan& plan) const
     {
-        plan.from_ = from;
-        plan.filler_ = fillerOf(region, from);
-        ActiveSpans& active = plan.active_;
+        plan.from = from;
+        plan.filler = fillerOf(region, from);
+        ActiveSpans& active = plan.active;
         active.clear();
         for (int y = 0; y < region.height(); ++y) {
             const std::size_t first = static_cast<std::size_t>(y) * from.stride;
             active.findRow(
                 y, 0, region.width(),
                 [&](int x, int count) {
-                    return findDifferent(from, first + static_cast<std::size_t>(x), plan.filler_, count);
+                    return findDifferent(from, first + static_cast<std::size_t>(x), plan.filler, count);
                 },
                 [](Span) {});
         }
         active.endRows();
-        SparseShape& shape = plan.header_.shape;
+        SparseShape& shape = plan.header.shape;
         shape = shapeOf(active, region);
         if (const std::size_t dense = mostBytes(static_cast<std::size_t>(region.width() * region.height()));
             shape.encoding != FragmentEncoding::Dense && bytesOf(shape) >= dense) {
@@ -88,35 +78,35 @@ public:
             shape = shapeOf(active, region);
         }
         shape.isSplit = splits;
-        plan.header_.tile = tile;
-        plan.bytes_ = bytesOf(shape);
+        plan.header.tile = tile;
+        plan.bytes = bytesOf(shape);
     }
 
-    // Writes plan.bytes() bytes.
+    // Writes plan.bytes bytes.
     void write(Plan& plan, std::byte* out) const
     {
-        std::memset(out + plan.bytes() - 16, 0, 16); // padding
-        const Header& h = plan.header_;
+        std::memset(out + plan.bytes - 16, 0, 16); // padding
+        const Header& h = plan.header;
         std::memcpy(out, &h, sizeof h);
         out += sizeof h;
         if (fillerBytes(h.shape) > 0)
-            out += format_.forEachPlane(1, [&](std::size_t c, std::size_t at, std::size_t bytes) {
-                std::memcpy(out + at, plan.from_.planes.at[c] + bytes * plan.filler_, bytes);
+            out += forEachPlane(1, [&](std::size_t c, std::size_t at, std::size_t bytes) {
+                std::memcpy(out + at, plan.from.planes.at[c] + bytes * plan.filler, bytes);
             });
         if (h.shape.isSplit)
-            plan.body_.resize(std::max(plan.body_.size(), format_.bodyBytes(h.shape)));
-        std::byte* const body = h.shape.isSplit ? plan.body_.data() : out;
-        encodeSparse(format_, h.shape, plan.active_, body, [&](std::size_t c, std::byte* to, std::size_t) {
+            plan.body.resize(std::max(plan.body.size(), bodyBytes(h.shape)));
+        std::byte* const body = h.shape.isSplit ? plan.body.data() : out;
+        encodeSparse(*this, h.shape, plan.active, body, [&](std::size_t c, std::byte* to, std::size_t) {
             const std::size_t each = pixelBytes(c);
-            const auto stride = static_cast<std::ptrdiff_t>(plan.from_.stride);
-            plan.active_.forEachSpan(stride, [&](std::ptrdiff_t first, int count) {
+            const auto stride = static_cast<std::ptrdiff_t>(plan.from.stride);
+            plan.active.forEachSpan(stride, [&](std::ptrdiff_t first, int count) {
                 const std::size_t bytes = each * static_cast<std::size_t>(count);
-                std::memcpy(to, plan.from_.planes.at[c] + each * static_cast<std::size_t>(first), bytes);
+                std::memcpy(to, plan.from.planes.at[c] + each * static_cast<std::size_t>(first), bytes);
                 to += bytes;
             });
         });
         if (h.shape.isSplit)
-            format_.split(h.shape, body, out);
+            split(h.shape, body, out);
     }
 
     // Checks the record that begins at `in` and has at most `left` bytes. Then calls `place(tile, region)`, which
@@ -139,15 +129,15 @@ public:
         if (left < bytes)
             failMalformed("a finished tile is too short", static_cast<std::int64_t>(bytes),
                           static_cast<std::int64_t>(left));
-        const ConstPlanes filler = format_.planesAt(in + sizeof h, 1);
+        const ConstPlanes filler = planesAt(in + sizeof h, 1);
         const std::byte* from = in + sizeof h + fillerBytes(shape);
         static thread_local std::vector<std::byte> joined;
         if (shape.isSplit) {
-            joined.resize(std::max(joined.size(), format_.bodyBytes(shape)));
-            format_.join(shape, from, joined.data());
+            joined.resize(std::max(joined.size(), bodyBytes(shape)));
+            join(shape, from, joined.data());
             from = joined.data();
         }
-        const SparseBody body = decodeSparse(format_, shape, region.width(), from);
+        const SparseBody body = decodeSparse(*this, shape, region.width(), from);
         const FinishedPlanes to = place(h.tile, region);
         for (std::size_t c = 0; c < channelCount; ++c)
             if (pixelBytes(c) > 0)
@@ -162,7 +152,7 @@ private:
     }
     std::size_t bytesOf(const SparseShape& shape) const
     {
-        return alignedTo16(sizeof(Header) + fillerBytes(shape) + format_.bodyBytes(shape));
+        return alignedTo16(sizeof(Header) + fillerBytes(shape) + bodyBytes(shape));
     }
 
     bool areAlike(const FinishedPlanes& planes, std::size_t a, std::size_t b) const
@@ -257,8 +247,6 @@ private:
             fill(row, x, region.width());
         }
     }
-
-    PlaneFormat format_;
 };
 
 } // namespace detail

@@ -153,7 +153,7 @@ public:
             }
         return at;
     }
-    // `Byte` may be const.
+    // The planes of a body with `pixels` pixels. `Byte` may be const.
     template <class Byte>
     BasicPlanes<Byte> planesAt(Byte* body, std::size_t pixels) const
     {

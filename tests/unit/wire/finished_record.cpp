@@ -55,7 +55,7 @@ std::vector<std::byte> recordOf(const FinishedRecord& record, int tile, const Pi
 {
     static FinishedRecord::Plan plan; // is used again, as there
     record.plan(tile, layout.region(tile), pixels.planes, splits, plan);
-    std::vector<std::byte> bytes(plan.bytes(), std::byte{0x55});
+    std::vector<std::byte> bytes(plan.bytes, std::byte{0x55});
     record.write(plan, bytes.data());
     return bytes;
 }
