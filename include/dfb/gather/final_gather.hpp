@@ -252,7 +252,10 @@ public:
             if (isFull)
                 full = closeBatch();
             if (!batch_) {
-                batch_ = takeSpare();
+                if (spareBatches_.empty())
+                    spareBatches_.push_back(std::make_shared<Batch>());
+                batch_ = std::move(spareBatches_.back());
+                spareBatches_.pop_back();
                 batch_->message = std::move(memory);
                 batch_->used = prefix;
                 ++sent_.batches;
@@ -579,16 +582,6 @@ private:
     {
         std::shared_ptr<Batch> closed = std::move(batch_);
         return closed->writers == 0 ? std::move(closed) : nullptr;
-    }
-
-    // Under mutex_.
-    std::shared_ptr<Batch> takeSpare()
-    {
-        if (spareBatches_.empty())
-            return std::make_shared<Batch>();
-        std::shared_ptr<Batch> batch = std::move(spareBatches_.back());
-        spareBatches_.pop_back();
-        return batch;
     }
 
     // Nobody else may use the batch any more.
