@@ -87,18 +87,6 @@ inline bool areConstant(const InputPixels& tile, const ConstPlanes& planes, std:
     return true;
 }
 
-inline void countFaults(const ActivePixels& active, const InputPixels& tile, ChannelMask channels, InputFaults& faults)
-{
-    faults.nonFinite += active.nanDepths();
-    if (!active.mayBeFaulty())
-        return;
-    const float* rgba = tile.hasBytes ? nullptr : floatsOf(tile.planes.at[Color]);
-    const float* depth = hasChannel(channels, Depth) ? floatsOf(tile.planes.at[Depth]) : nullptr;
-    active.forEachSpan(tile.stride, [&](std::ptrdiff_t first, int count) {
-        countFaults(rgba ? rgba + 4 * first : nullptr, depth ? depth + first : nullptr, count, faults);
-    });
-}
-
 inline FragmentHeader fragmentHeader(const InputPixels& tile, ChannelMask channels)
 {
     FragmentHeader h;
@@ -148,8 +136,7 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     auto* colors = isRounded ? reinterpret_cast<std::byte*>(wide.data()) : message.data() + fragmentPrefix;
     const float* rgba = floatsOf(colors);
     auto* depths = isRounded ? nullptr : floatsOf(colors + gathered.pixelBytes(Color) * pixelCount);
-    const ConstPlanes planes = active.gather(tile, channels, coder.activeByDepth(), colors, depths);
-    countFaults(active, tile, channels, faults);
+    const ConstPlanes planes = active.gather(tile, channels, coder.activeByDepth(), colors, depths, faults);
 
     FragmentHeader h = fragmentHeader(tile, channels);
     h.shape = shapeOf(active, tile.region);

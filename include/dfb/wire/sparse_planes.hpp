@@ -289,8 +289,9 @@ public:
     // the form in which they travel: colours to `colors`, which has room for all pixels of the tile, depths to
     // `depths`, if that is not null, and the rest to memory of its own. Returns where they are. Each row is copied as
     // soon as its spans are found, so that it is read from memory only once: rows of a large image are far apart.
-    ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, std::byte* colors,
-                       float* depths = nullptr)
+    // Adds to `faults`.
+    ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, std::byte* colors, float* depths,
+                       InputFaults& faults)
     {
         const auto most =
             static_cast<std::size_t>(tile.region.width()) * static_cast<std::size_t>(tile.region.height());
@@ -311,39 +312,36 @@ public:
                 result.at[c] = to;
             }
         clear();
-        nanDepths_ = 0;
-        bool isClean = true;
         const PixelsInPlace its = pixelsInPlace(tile, depthChannel, byDepth);
         const Region& valid = its.valid;
         const int yEnd = its.color && valid.width() > 0 ? valid.y1 : 0;
         for (int y = valid.y0; y < yEnd; ++y) {
             const int ahead = rowAhead(y, yEnd, valid.width());
             const auto bitsOf = [&](int x, int count) {
-                return its.activity.bits(its.at(x, y), its.at(x, ahead), count, nanDepths_);
+                return its.activity.bits(its.at(x, y), its.at(x, ahead), count, faults.nonFinite);
             };
             findRow(y, valid.x0, valid.x1, bitsOf, [&](Span span) {
                 const std::ptrdiff_t first = y * tile.stride + span.x;
+                bool isClean = true;
                 for (std::size_t i = 0; i < targetCount; ++i) {
                     const auto [channel, to] = targets[i];
                     const auto bytes = static_cast<std::ptrdiff_t>(tile.pixelBytes(channel));
                     isClean &= copyAndCheck(channel, bytes, tile.planes.at[channel] + bytes * first, span.count, to);
                     targets[i].to += bytes * span.count;
                 }
+                if (!isClean) {
+                    const RowPlace from = its.at(span.x, y);
+                    countFaults(tile.hasBytes ? nullptr : floatsOf(from.color),
+                                hasChannel(channels, Depth) ? from.depth : nullptr, span.count, faults);
+                }
             });
         }
         endRows();
-        isClean_ = isClean;
         return result;
     }
-    // False if all colours are finite, all alphas within [0, 1], and no depth is NaN.
-    bool mayBeFaulty() const noexcept { return !isClean_; }
-    // Pixels that are not active because their depth is NaN.
-    std::uint64_t nanDepths() const noexcept { return nanDepths_; }
 
 private:
     std::array<std::vector<float>, channelCount> planes_; // words of 4 bytes; ids are copied bit for bit
-    bool isClean_ = true;
-    std::uint64_t nanDepths_ = 0;
 };
 
 } // namespace detail

@@ -67,6 +67,7 @@ TEST_CASE("Spans reach over the places where a row is cut for the search", "[wir
     using Tile = dfb::Tile<dfb::colorChannel, size>;
     const auto tile = std::make_unique<Tile>();
     dfb::detail::ActivePixels active;
+    dfb::detail::InputFaults faults;
     std::vector<float> colors(4 * size * size);
     for (const int width : {1, 63, 64, 65, 127, 128, 129, 256}) {
         tile->clear();
@@ -75,7 +76,7 @@ TEST_CASE("Spans reach over the places where a row is cut for the search", "[wir
             tile->pixel(x, 0)[3] = 1;                   // all
             tile->pixel(x, 1)[0] = x % 64 != 5 ? 1 : 0; // with gaps
         }
-        active.gather(*tile, dfb::colorChannel, false, reinterpret_cast<std::byte*>(colors.data()));
+        active.gather(*tile, dfb::colorChannel, false, reinterpret_cast<std::byte*>(colors.data()), nullptr, faults);
         REQUIRE(active.rowCounts.size() == 2);
         CHECK(active.rowCounts[0] == 1);
         CHECK(active.spans[0].count == width);
@@ -109,12 +110,14 @@ TEST_CASE("Outside of a view's valid region nothing is read", "[wire]")
                     image[static_cast<std::size_t>(4 * (y * stride + x) + c)] =
                         valid.contains(r.x0 + x, r.y0 + y) ? (random() % 8 ? 0.5f : 0.0f) : notANumber;
         dfb::detail::ActivePixels narrow, wide;
-        narrow.gather(view, dfb::colorChannel, false, reinterpret_cast<std::byte*>(colors.data()));
-        CHECK_FALSE(narrow.mayBeFaulty());
+        dfb::detail::InputFaults faults;
+        narrow.gather(view, dfb::colorChannel, false, reinterpret_cast<std::byte*>(colors.data()), nullptr, faults);
+        CHECK((faults.nonFinite == 0 && faults.alphaOutside == 0));
         for (float& value : image)
             value = std::isnan(value) ? 0 : value;
         view.valid = view.region;
-        wide.gather(view, dfb::colorChannel, false, reinterpret_cast<std::byte*>(expectedColors.data()));
+        wide.gather(view, dfb::colorChannel, false, reinterpret_cast<std::byte*>(expectedColors.data()), nullptr,
+                    faults);
         REQUIRE(narrow.pixels == wide.pixels);
         CHECK((narrow.pixels == 0 || (narrow.rowBegin == wide.rowBegin && narrow.rowEnd == wide.rowEnd)));
         CHECK(narrow.rowCounts == wide.rowCounts);
