@@ -14,7 +14,6 @@
 #include <dfb/wire/wire_kernels.hpp>
 
 #include <algorithm>
-#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>

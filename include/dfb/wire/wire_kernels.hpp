@@ -48,12 +48,6 @@ inline std::uint16_t positiveToHalf(float value) noexcept
 }
 inline float positiveFromHalf(std::uint16_t half) noexcept { return floatOf((half & 0x7fffu) << 13) * 0x1p112f; }
 
-// Rounds a value within [0, 65535] to the nearest integer, ties to even.
-inline std::uint32_t nearestInteger(float value) noexcept
-{
-    return bitsOf(value + 0x1p23f) & 0x7fffffu; // the addition leaves no bit below one
-}
-
 // The codes in which a scaled channel of a colour travels. No pixel in range has a code above `most`.
 struct HalfCode {
     using Word = std::uint16_t;
@@ -65,7 +59,8 @@ template <class Unsigned>
 struct UnormCode {
     using Word = Unsigned;
     static constexpr Word most = std::numeric_limits<Word>::max();
-    static Word of(float value) noexcept { return static_cast<Word>(nearestInteger(value)); }
+    // The addition leaves no bit below one: it rounds to an integer, ties to even, which is in the lowest bits.
+    static Word of(float value) noexcept { return static_cast<Word>(bitsOf(value + 0x1p23f)); }
     static float valueOf(Word code) noexcept { return static_cast<float>(code); }
 };
 
