@@ -53,20 +53,12 @@ public:
                               || !row.aux.instanceId.empty();
         if (!wantsAux && compositeInPlace(row))
             return;
-        const bool isOneRun = takeRows(wantsAux) && !wantsAux;
+        const bool areAlike = takeRows(wantsAux);
         const int width = static_cast<int>(row.transmittance.size());
         if (active_.empty()) {
             clearGap(row, 0, width);
-        } else if (isOneRun) {
-            const Span span = *active_.front().spans;
-            clearGap(row, 0, span.x);
-            clearGap(row, span.x + span.count, width);
-            layers_.resize(active_.size());
-            for (std::size_t k = 0; k < layers_.size(); ++k)
-                layers_[k] = {active_[k].color, active_[k].depth, nullptr};
-            addRun(row, span.x, span.count);
-        } else if (active_.size() == 1 && !wantsAux) {
-            compositeSpans(row, active_.front());
+        } else if (areAlike && !wantsAux) {
+            compositeSpans(row);
         } else {
             findEdges(width);
             if (rule_ == BlendRule::InOrder && !wantsAux && row.rgbaLow.empty() && areRunsShort()) {
@@ -146,8 +138,8 @@ private:
             row.clear(begin, end - begin);
     }
 
-    // Sets active_ to the next row of each fragment that has pixels there. Returns true if each of these rows is a
-    // single span, the same in all.
+    // Sets active_ to the next row of each fragment that has pixels there. Returns true if there is only one, or if
+    // each is a single span, the same in all.
     bool takeRows(bool wantsAux)
     {
         bool isOneRun = true;
@@ -165,7 +157,7 @@ private:
             isOneRun = isOneRun && r.spanCount == 1 && a.x == b.x && a.count == b.count;
         }
         active_.resize(rows);
-        return isOneRun;
+        return isOneRun || rows == 1;
     }
 
     // Composites the next row if all inputs lie in place and cover the same pixels: then each colour is read once, and
@@ -260,16 +252,18 @@ private:
         return detail::firstOutOfOrder(layers_, order_, 0, count) == count;
     }
 
-    // Composites the row `r` of the only fragment that has pixels there.
-    void compositeSpans(CompositeRow& row, const FragmentRow& r)
+    // Composites active_, if takeRows() has returned true.
+    void compositeSpans(CompositeRow& row)
     {
-        Layer layer{r.color, r.depth, nullptr};
+        layers_.resize(active_.size());
+        for (std::size_t k = 0; k < layers_.size(); ++k)
+            layers_[k] = {active_[k].color, active_[k].depth, nullptr};
+        const FragmentRow& first = active_.front();
         int end = 0;
-        for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span) {
+        for (const Span* span = first.spans; span != first.spans + first.spanCount; ++span) {
             clearGap(row, end, span->x, end > 0);
-            layers_.assign(1, layer);
             addRun(row, span->x, span->count);
-            layer = layer.from(span->count);
+            layers_.front() = layers_.front().from(span->count); // if there is another span, it is the only layer
             end = span->x + span->count;
         }
         clearGap(row, end, static_cast<int>(row.transmittance.size()));
