@@ -162,9 +162,8 @@ private:
 
     // Composites the next row if all inputs lie in place and cover the same pixels: then each colour is read once, and
     // not copied. Returns false if the row must be composited otherwise.
-    bool compositeInPlace([[maybe_unused]] CompositeRow& row)
+    bool compositeInPlace(CompositeRow& row)
     {
-#if defined(DFB_HAS_AVX2_CLONES)
         if (rule_ == BlendRule::Nearest || row.wantsDepth || !row.rgbaLow.empty() || !detail::cpuHasAvx2())
             return false;
         if (!findInPlace() || !(row.minTransmittance > 0 ? blendInPlace<true>(row) : blendInPlace<false>(row)))
@@ -174,16 +173,13 @@ private:
         clearGap(row, span.x + span.count, static_cast<int>(row.transmittance.size()));
         skipRows(1);
         return true;
-#else
-        return false;
-#endif
     }
 
-#if defined(DFB_HAS_AVX2_CLONES)
-    // Blends rows_. Returns false if `row` is undefined afterwards.
+    // Blends rows_, with AVX2. Returns false if `row` is undefined afterwards.
     template <bool HasLeast>
-    bool blendInPlace(CompositeRow& row)
+    bool blendInPlace([[maybe_unused]] CompositeRow& row)
     {
+#if defined(DFB_HAS_AVX2_CLONES)
         const Span span = rows_.front().span;
         const int x = span.x, count = span.count, layers = static_cast<int>(cursors_.size());
         double* const rgba = row.rgba.data() + 4 * x;
@@ -212,8 +208,10 @@ private:
         if (!isGood)
             runs_.clear();
         return isGood;
-    }
+#else
+        return false;
 #endif
+    }
 
     // Sets rows_ and layers_ for all inputs. Returns false if they do not cover the same pixels.
     bool findInPlace()
@@ -356,14 +354,18 @@ private:
         }
     }
 
-    // Composites layers_, which have `count` pixels each, and adds the run.
+    // Composites layers_, which have `count` pixels each, by the rule, and adds the run.
     void addRun(CompositeRow& row, int x, int count)
     {
         if (!row.wantsSingles && layers_.size() == 1 && count >= wideSingle) {
             runs_.push_back({x, count, layers_.front().color});
             return;
         }
-        composite(row, x, count);
+        switch (rule_) {
+        case BlendRule::SortByDepth: sortAndBlend(row, x, count, layers_, order_); break;
+        case BlendRule::InOrder: blendInOrder(row, x, count, layers_, order_); break;
+        case BlendRule::Nearest: keepNearest(row, x, count, layers_); break;
+        }
         joinRun(x, count);
     }
 
@@ -392,16 +394,6 @@ private:
             for (std::uint64_t bits = marks_[word]; bits != 0; bits &= bits - 1)
                 *next++ = static_cast<int>(64 * word) + detail::zerosBelow(bits);
         edgeCount_ = static_cast<std::size_t>(next - edges_.data());
-    }
-
-    // Composites layers_, which have `count` pixels each, by the rule.
-    void composite(CompositeRow& row, int x, int count)
-    {
-        switch (rule_) {
-        case BlendRule::SortByDepth: sortAndBlend(row, x, count, layers_, order_); break;
-        case BlendRule::InOrder: blendInOrder(row, x, count, layers_, order_); break;
-        case BlendRule::Nearest: keepNearest(row, x, count, layers_); break;
-        }
     }
 
     BlendRule rule_ = BlendRule::SortByDepth;
