@@ -382,6 +382,7 @@ DFB_COMPILED_ONCE void FragmentStore::finish(FinishedTile& out)
             finishLevels(out);
         else
             finishRuns(out);
+        fragments_.clear();
         return;
     }
     const bool direct = last == 0 && (tracked_ & imageAuxChannels) == 0;
@@ -481,7 +482,6 @@ DFB_COMPILED_ONCE void FragmentStore::finishRuns(FinishedTile& out)
         out.fillPixels(x, y, out.width() - x, background.data());
         roundExactly(out, y, farthest);
     }
-    fragments_.clear();
 }
 
 inline bool areOpaque(const std::byte* rgba, int count)
@@ -522,7 +522,6 @@ DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
         });
         roundExactly(out, y, farthest);
     }
-    fragments_.clear();
 }
 
 // Whether integers are enough to blend inputs of 8 bits a channel.
@@ -546,7 +545,6 @@ DFB_COMPILED_ONCE void FragmentStore::finishLevels(FinishedTile& out)
             out, y, background, [&](int x, int count) { return activeByteBits(levels + 4 * x, count); },
             [&](int x, int count) { out.setStored(x, y, count, levels + 4 * x, nullptr); });
     }
-    fragments_.clear();
 }
 
 // Rounds a row again where double does not tell which 8-bit level is nearer. `farthest`: the result of setRow() or
