@@ -9,6 +9,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <limits>
+#include <optional>
 #include <vector>
 
 DFB_NAMESPACE_BEGIN
@@ -61,9 +62,8 @@ public:
     {
         base_.newFrame(info);
         info_ = info;
-        if (isFresh_ || info.accumulationId != accumulationId_ || (info.passes > 0 && info.firstSample == 0)
+        if (info.accumulationId != accumulationId_ || (info.passes > 0 && info.firstSample == 0)
             || info.emptySamples > 0) {
-            isFresh_ = false;
             accumulationId_ = info.accumulationId;
             samples_ = info.emptySamples;
             sums_.reset(pixelCount(), info.wanted);
@@ -131,8 +131,7 @@ private:
 
     Base base_;
     TileInfo info_;
-    bool isFresh_ = true;
-    std::uint64_t accumulationId_ = 0;
+    std::optional<std::uint64_t> accumulationId_; // empty until the first frame
     std::int64_t samples_ = 0;
     detail::PixelSums sums_;
     std::vector<double> m2_; // per pixel, see growthOfM2()
