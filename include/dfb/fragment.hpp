@@ -67,8 +67,6 @@ public:
         : header_(header), storage_(std::move(storage)), parts_(parts)
     {
     }
-    Fragment(Fragment&&) noexcept = default;
-    Fragment& operator=(Fragment&&) noexcept = default;
 
     const TileHeader& header() const noexcept { return header_; }
     bool empty() const noexcept { return parts_.encoding == FragmentEncoding::Empty; }
@@ -133,8 +131,8 @@ public:
     explicit FragmentCursor(const Fragment& fragment, detail::RowPixels* row = nullptr, bool countsFaults = false)
         : parts_(&fragment.parts_), span_(fragment.parts_.spans), color_(fragment.parts_.color),
           bytes_(fragment.parts_.bytes), depth_(fragment.parts_.depth), aux_(fragment.parts_.aux),
-          hasAux_((fragment.parts_.channels & ~(colorChannel | depthChannel)) != 0), countsFaults_(countsFaults),
-          rowPixels_(row)
+          hasAux_((fragment.parts_.channels & ~(colorChannel | depthChannel)) != 0),
+          faults_(countsFaults ? fragment.parts_.faults : nullptr), rowPixels_(row)
     {
         if (!row && fragment.isMadeByRow()) {
             ownRow_ = std::make_unique<detail::RowPixels>();
@@ -191,8 +189,8 @@ public:
     // Adds `count` NaN depths that the caller of nextBytes() has found to the frame's counts.
     void countNanDepths(std::uint64_t count)
     {
-        if (count > 0 && countsFaults_ && parts_->faults)
-            parts_->faults->add({count, 0});
+        if (count > 0 && faults_)
+            faults_->add({count, 0});
     }
     const detail::ConstPlanes& aux() const noexcept { return aux_; } // of the row that next() returned
 
@@ -279,8 +277,8 @@ private:
     {
         detail::InputFaults faults;
         parts_->inPlace.readRow(y, *rowPixels_, faults);
-        if (countsFaults_ && parts_->faults)
-            parts_->faults->add(faults);
+        if (faults_)
+            faults_->add(faults);
         result.spans = rowPixels_->active.spans.data();
         result.spanCount = static_cast<int>(rowPixels_->active.spans.size());
         result.color = rowPixels_->color.data();
@@ -306,7 +304,8 @@ private:
     const std::byte* bytes_;
     const float* depth_;
     detail::ConstPlanes aux_;
-    bool hasAux_, countsFaults_;
+    bool hasAux_;
+    detail::FaultCounts* faults_; // null: they are not counted
     int row_ = 0;
     detail::RowPixels* rowPixels_; // of the row that next() returned
     std::unique_ptr<detail::RowPixels> ownRow_;
