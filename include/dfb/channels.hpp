@@ -87,7 +87,6 @@ inline const std::uint32_t* idsOf(const std::byte* plane) noexcept
 {
     return reinterpret_cast<const std::uint32_t*>(plane);
 }
-inline std::uint32_t* idsOf(std::byte* plane) noexcept { return reinterpret_cast<std::uint32_t*>(plane); }
 
 // Whether alpha is 1 in all pixels of a colour plane, which has a byte a channel or floats; rows are `stride` pixels
 // apart. Stops at the first pixel that is not opaque.

@@ -12,8 +12,7 @@
 //                                                one by one nor travel. Default false.
 //   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
 //   void newFrame(const FrameData&);             called in begin(), once a frame on every rank, if there is one;
-//   without
-//                                                a FrameData it takes a const NoFrameData&
+//                                                without a FrameData it takes a const NoFrameData&
 #pragma once
 
 #include <dfb/base/detect.hpp>

@@ -180,13 +180,12 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     }
 
     // Sets all pixels to one premultiplied RGBA colour at one depth.
-    void fill(const float (&rgba)[4], float depthValue = std::numeric_limits<float>::infinity())
+    void fill(const float (&rgba)[4], [[maybe_unused]] float depthValue = std::numeric_limits<float>::infinity())
     {
         for (int i = 0; i < Size * Size; ++i)
             std::memcpy(color + 4 * i, rgba, sizeof rgba);
         if constexpr (hasDepth)
             std::fill_n(this->depth, Size * Size, depthValue);
-        (void)depthValue;
     }
 
     // Calls f(x, y, rgba, depth), or f(x, y, rgba), for each pixel of the region, row by row: x and y are its place in
@@ -197,7 +196,7 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     {
         for (int y = 0; y < region.height(); ++y)
             for (int x = 0; x < region.width(); ++x) {
-                const int i = y * Size + x;
+                [[maybe_unused]] const int i = y * Size + x;
                 if constexpr (hasDepth && std::is_invocable_v<const PixelFunction&, int, int, float*, float&, int>)
                     f(region.x0 + x, region.y0 + y, pixel(x, y), this->depth[i], i);
                 else if constexpr (hasDepth && !std::is_invocable_v<const PixelFunction&, int, int, float*>)
@@ -206,7 +205,6 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
                     f(region.x0 + x, region.y0 + y, pixel(x, y), i);
                 else
                     f(region.x0 + x, region.y0 + y, pixel(x, y));
-                (void)i;
             }
     }
 

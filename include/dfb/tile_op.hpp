@@ -356,10 +356,10 @@ double FinishedTile::convert(const Real* rgba, int count, std::byte* color) cons
 template <class Real>
 double FinishedTile::setRow(int y, const Real* rgba, const float* depth, const AuxRow& aux)
 {
-    const std::size_t first = static_cast<std::size_t>(y) * stride_;
+    const std::size_t first = pixelAt(0, y);
     overwrites(0, y, width());
     double farthest = 0;
-    if (std::byte* color = to_.at[detail::Color]; color) {
+    if (std::byte* color = to_.at[detail::Color]) {
         color += first * bytesPerPixel(format_);
         farthest = dither_ ? ditherPixels(rgba, width(), format_, region_.x0, region_.y0 + y, color)
                            : convert(rgba, width(), color);
@@ -367,7 +367,7 @@ double FinishedTile::setRow(int y, const Real* rgba, const float* depth, const A
     const auto set = [&](detail::Channel channel, const auto* from, auto empty) {
         if (!to_.at[channel])
             return;
-        const auto words = static_cast<std::size_t>(detail::channelWords[channel]);
+        const std::size_t words = detail::channelWords[channel];
         const std::size_t count = words * static_cast<std::size_t>(width());
         auto* out = reinterpret_cast<decltype(empty)*>(to_.at[channel]) + words * first;
         if (from)
