@@ -31,10 +31,13 @@ public:
         isFull_ = true;
         std::size_t made = 0;
         for (; begin != end; ++begin)
-            if ((*begin)->isMadeByRow())
-                cursors_.push_back(FragmentCursor(**begin, rowPixels(made++), isFirst));
-            else if (!(*begin)->empty())
+            if ((*begin)->isMadeByRow()) {
+                if (made == rowPixels_.size())
+                    rowPixels_.push_back(std::make_unique<detail::RowPixels>());
+                cursors_.push_back(FragmentCursor(**begin, rowPixels_[made++].get(), isFirst));
+            } else if (!(*begin)->empty()) {
                 cursors_.push_back(FragmentCursor(**begin));
+            }
     }
 
     void skipRows(int count)
@@ -103,13 +106,6 @@ private:
     static constexpr int narrowGap = 32;  // compositing a gap narrower than this costs less than a new run
     static constexpr int wideSingle = 16; // the same holds for a single layer, which could be taken as it is
     static constexpr int shortRun = 32;   // if runs are shorter on average, layers are blended one by one
-
-    detail::RowPixels* rowPixels(std::size_t cursor)
-    {
-        while (rowPixels_.size() <= cursor)
-            rowPixels_.push_back(std::make_unique<detail::RowPixels>());
-        return rowPixels_[cursor].get();
-    }
 
     // Calls f(span, layer) for each span of the next row of all fragments, which must keep their bytes. f returns how
     // many depths are NaN.
@@ -397,9 +393,9 @@ private:
     }
 
     BlendRule rule_ = BlendRule::SortByDepth;
-    std::array<detail::RowInPlace, detail::mostInPlace> rows_,
-        ordered_;         // of all inputs, and the same in blending order; kept from row to row
-    bool isFull_ = false; // rows in place had one order and no gaps so far
+    std::array<detail::RowInPlace, detail::mostInPlace> rows_;    // of all inputs
+    std::array<detail::RowInPlace, detail::mostInPlace> ordered_; // the same in blending order
+    bool isFull_ = false;                                         // rows in place had one order and no gaps so far
     std::vector<FragmentCursor> cursors_;
     std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of the cursors that need scratch memory
     std::vector<FragmentRow> active_;
