@@ -54,7 +54,6 @@ struct AuxPixels {
     }
 };
 
-// One row of pixels being composited.
 struct CompositeRow {
     std::vector<double> rgba;          // 4 * width, premultiplied
     std::vector<double> transmittance; // width

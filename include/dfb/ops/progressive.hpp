@@ -64,11 +64,13 @@ public:
         info_ = info;
         if (info.accumulationId != accumulationId_ || (info.passes > 0 && info.firstSample == 0)
             || info.emptySamples > 0) {
+            const std::size_t pixels =
+                static_cast<std::size_t>(info.region.width()) * static_cast<std::size_t>(info.region.height());
             accumulationId_ = info.accumulationId;
             samples_ = info.emptySamples;
-            sums_.reset(pixelCount(), info.wanted);
+            sums_.reset(pixels, info.wanted);
             sums_.addBackground(info.emptySamples, info.background);
-            m2_.assign(pixelCount(), 0.0); // right for the empty samples too, as they are all alike
+            m2_.assign(pixels, 0.0); // right for the empty samples too, as they are all alike
         }
         if (info.passes > 0 && info.firstSample != samples_)
             detail::failArgument("the tile has accumulated %lld samples, the frame gives it those from %d on",
@@ -102,11 +104,6 @@ public:
     }
 
 private:
-    std::size_t pixelCount() const
-    {
-        return static_cast<std::size_t>(info_.region.width()) * static_cast<std::size_t>(info_.region.height());
-    }
-
     // The largest mean of M2 over the pixels of a block. Values that are not finite count as 0: with them, the tile
     // would get samples for ever.
     double worstBlock() const
