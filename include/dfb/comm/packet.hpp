@@ -28,14 +28,20 @@ constexpr std::size_t packetBytes = 8192; // at most
 // change: ranks built with different formats cannot read each other's packets, and find out before the first one.
 constexpr std::uint64_t packetFormat = 3;
 
-// Fills one packet after the other. Records begin at multiples of 16.
+// The bytes of a record and its payload in a packet: records begin at multiples of 16.
+constexpr std::size_t paddedRecord(std::size_t payloadBytes)
+{
+    return (2 * sizeof(PacketRecord) - 1 + payloadBytes) / sizeof(PacketRecord) * sizeof(PacketRecord);
+}
+
+// Fills one packet after the other.
 class PacketWriter {
 public:
     explicit PacketWriter(std::shared_ptr<MemoryPool> pool) : pool_(std::move(pool)) {}
 
     // Whether a message can travel in a packet at all, and whether the present one has room for that many bytes.
-    static constexpr bool canHold(std::size_t payloadBytes) { return padded(payloadBytes) <= packetBytes; }
-    bool hasRoom(std::size_t payloadBytes) const noexcept { return used_ + padded(payloadBytes) <= packetBytes; }
+    static constexpr bool canHold(std::size_t payloadBytes) { return paddedRecord(payloadBytes) <= packetBytes; }
+    bool hasRoom(std::size_t payloadBytes) const noexcept { return used_ + paddedRecord(payloadBytes) <= packetBytes; }
     bool empty() const noexcept { return used_ == 0; }
 
     // There must be room for it.
@@ -48,8 +54,8 @@ public:
         if (payloadBytes > 0)
             std::memcpy(to + sizeof record, payload, payloadBytes);
         const std::size_t end = sizeof record + payloadBytes;
-        std::memset(to + end, 0, padded(payloadBytes) - end);
-        used_ += padded(payloadBytes);
+        std::memset(to + end, 0, paddedRecord(payloadBytes) - end);
+        used_ += paddedRecord(payloadBytes);
     }
 
     // Returns the packet, and begins the next.
@@ -60,11 +66,6 @@ public:
     }
 
 private:
-    static constexpr std::size_t padded(std::size_t payloadBytes)
-    {
-        return (2 * sizeof(PacketRecord) - 1 + payloadBytes) / sizeof(PacketRecord) * sizeof(PacketRecord);
-    }
-
     std::shared_ptr<MemoryPool> pool_;
     Buffer packet_;
     std::size_t used_ = 0;
@@ -76,30 +77,22 @@ private:
 template <class Visit>
 bool readPacket(const std::byte* from, std::size_t left, const Visit& visit)
 {
-    constexpr std::size_t step = sizeof(PacketRecord);
     while (left > 0) {
         PacketRecord record;
-        if (left < step)
+        if (left < sizeof record)
             return false;
-        std::memcpy(&record, from, step);
-        from += step;
-        left -= step;
+        std::memcpy(&record, from, sizeof record);
         if (record.kind > PacketRecord::Failure)
             return false;
-        if (record.kind == PacketRecord::Announcement || record.kind == PacketRecord::Lent) {
-            if (record.tag < 1 || record.byteCount == 0)
-                return false;
-            visit(record, static_cast<const std::byte*>(nullptr));
-            continue;
-        }
-        if (record.byteCount > left)
+        const bool isElsewhere = record.kind == PacketRecord::Announcement || record.kind == PacketRecord::Lent;
+        if (isElsewhere ? record.tag < 1 || record.byteCount == 0 : record.byteCount > left)
             return false;
-        const std::size_t paddedBytes = (static_cast<std::size_t>(record.byteCount) + step - 1) / step * step;
-        if (paddedBytes > left)
+        const std::size_t end = paddedRecord(isElsewhere ? 0 : static_cast<std::size_t>(record.byteCount));
+        if (end > left)
             return false;
-        visit(record, from);
-        from += paddedBytes;
-        left -= paddedBytes;
+        visit(record, isElsewhere ? nullptr : from + sizeof record);
+        from += end;
+        left -= end;
     }
     return true;
 }
