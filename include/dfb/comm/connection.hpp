@@ -14,7 +14,6 @@
 #include <atomic>
 #include <chrono>
 #include <cstdint>
-#include <cstring>
 #include <exception>
 #include <functional>
 #include <limits>
@@ -190,12 +189,8 @@ public:
             const std::lock_guard<std::mutex> lock(peersMutex_);
             header.sequence = peers_[destination].sent++;
         }
-        header.checksum = 0;
-        std::memcpy(message.data(), &header, sizeof header);
-        if (config_.checksums) {
-            header.checksum = checksumOf(message);
-            std::memcpy(message.data(), &header, sizeof header);
-        }
+        header.checksum = config_.checksums ? checksumOf(header, message) : 0;
+        detail::storeAll(message.data(), header);
         link_->send(destination, std::move(message));
         return header.sequence;
     }
@@ -319,7 +314,7 @@ public:
         if (!failed_)
             return;
         const std::lock_guard<std::mutex> lock(failureMutex_);
-        throw TransportError(*failure_);
+        throw TransportError(failure_);
     }
 
     // Tells the other ranks that this one cannot go on, so that nobody waits for it. Returns false if the connection
@@ -359,8 +354,11 @@ private:
         link_->stop(!failed_);
     }
 
-    static std::uint32_t checksumOf(const Buffer& message)
+    // Writes the header, with 0 in place of the checksum.
+    static std::uint32_t checksumOf(detail::MessageHeader header, Buffer& message)
     {
+        header.checksum = 0;
+        detail::storeAll(message.data(), header);
         const std::uint32_t crc = crc32c(message.data(), message.size());
         return crc == 0 ? 1 : crc;
     }
@@ -375,17 +373,15 @@ private:
                || kind == Kind::Pong;
     }
 
-    void checkChecksum(detail::MessageHeader header, Buffer& message) const
+    void checkChecksum(const detail::MessageHeader& header, Buffer& message) const
     {
         const std::uint32_t got = header.checksum;
         if ((got != 0) != config_.checksums && (isAlike_ || !isOfSetUp(header.kind)))
             detail::failMalformed(got != 0 ? "with a checksum; this rank uses none" : "without a checksum");
         if (got == 0)
             return;
-        header.checksum = 0;
-        std::memcpy(message.data(), &header, sizeof header);
-        if (checksumOf(message) != got)
-            detail::failMalformed("the checksum is wrong", got, checksumOf(message));
+        if (const std::uint32_t sum = checksumOf(header, message); sum != got)
+            detail::failMalformed("the checksum is wrong", got, sum);
     }
 
     void receive(int source, Buffer&& message) override
@@ -457,12 +453,10 @@ private:
 
     bool setFailure(const ErrorInfo& error)
     {
-        {
-            const std::lock_guard<std::mutex> lock(failureMutex_);
-            if (failure_)
-                return false;
-            failure_ = error;
-        }
+        const std::lock_guard<std::mutex> lock(failureMutex_);
+        if (failed_)
+            return false;
+        failure_ = error;
         failed_ = true;
         return true;
     }
@@ -567,7 +561,7 @@ private:
     std::uint32_t addresses_ = 0;
 
     mutable std::mutex failureMutex_;
-    std::optional<ErrorInfo> failure_;
+    ErrorInfo failure_;                     // if failed_; under failureMutex_
     std::weak_ptr<const void> thrownByAll_; // under failureMutex_
     std::atomic<bool> failed_{false};
 
