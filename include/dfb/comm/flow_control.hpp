@@ -158,11 +158,8 @@ public:
             failMalformed("credit for more than was sent", static_cast<std::int64_t>(out.sent),
                           static_cast<std::int64_t>(credit.consumed));
         out.granted = std::max(out.granted, credit.granted);
-        if (credit.consumed > out.consumed) {
-            const std::uint64_t more = credit.consumed - out.consumed;
-            out.consumed += more;
-            underWay_ -= more;
-        }
+        if (credit.consumed > out.consumed)
+            underWay_ -= credit.consumed - std::exchange(out.consumed, credit.consumed);
         while (!out.queue.empty() && out.sent + out.queue.front().size() <= out.granted) {
             Buffer message = out.queue.pop();
             out.sent += message.size();
