@@ -68,7 +68,10 @@ public:
                  }}),
           reductions_(connection_->rank(), connection_->size(),
                       [this](int to, const ReductionKey& key, bool up, const Bytes& bytes) {
-                          sendReduction(to, key, up, bytes);
+                          Bytes body;
+                          body.put(key.scope);
+                          body.append(bytes.begin(), bytes.end());
+                          send(to, up ? MessageKind::ReduceUp : MessageKind::ReduceDown, key.number, body);
                       })
     {
         inbox_.reserve(256); // usually no more wait at once
@@ -409,17 +412,17 @@ public:
         Bytes mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
         for (const std::int64_t value : values)
             mine.put(value);
-        const Bytes result = reduceParts(std::move(mine), [operation](ByteReader& a, ByteReader& b, Bytes& out) {
+        const auto combine = [operation](ByteReader& a, ByteReader& b, Bytes& out) {
             while (a.left() > 0) {
                 const auto x = a.get<std::int64_t>(), y = b.get<std::int64_t>();
                 out.put(operation(x, y));
             }
-        });
-        ByteReader in = partIn(result);
+        };
         std::vector<std::int64_t> reduced(values.size());
-        for (std::int64_t& value : reduced)
-            value = in.get<std::int64_t>();
-        in.end();
+        reduceParts(std::move(mine), combine, [&](ByteReader& in) {
+            for (std::int64_t& value : reduced)
+                value = in.get<std::int64_t>();
+        });
         return reduced;
     }
 
@@ -431,20 +434,20 @@ public:
         mine.put(static_cast<std::int32_t>(rank()));
         mine.put(static_cast<std::uint64_t>(own.size()));
         mine.append(own.data(), own.data() + own.size());
-        const Bytes all = reduceParts(std::move(mine), [](ByteReader& a, ByteReader& b, Bytes& out) {
+        const auto combine = [](ByteReader& a, ByteReader& b, Bytes& out) {
             a.copyTo(out);
             b.copyTo(out);
-        });
+        };
         std::vector<std::vector<std::byte>> result;
-        ByteReader in = partIn(all);
-        for (int from = 0; from < size(); ++from) { // they were combined in this order
-            const auto whose = in.get<std::int32_t>();
-            const auto byteCount = in.get<std::uint64_t>();
-            in.require(whose == from && byteCount <= in.left());
-            result.emplace_back(static_cast<std::size_t>(byteCount));
-            in.getBytes(result.back().data(), result.back().size());
-        }
-        in.end();
+        reduceParts(std::move(mine), combine, [&](ByteReader& in) {
+            for (int from = 0; from < size(); ++from) { // they were combined in this order
+                const auto whose = in.get<std::int32_t>();
+                const auto byteCount = in.get<std::uint64_t>();
+                in.require(whose == from && byteCount <= in.left());
+                result.emplace_back(static_cast<std::size_t>(byteCount));
+                in.getBytes(result.back().data(), result.back().size());
+            }
+        });
         return result;
     }
 
@@ -460,10 +463,12 @@ private:
     }
 
     // Reduces the parts that ranks bring to a call. `combine(a, b, out)` combines what follows the call's name in two
-    // parts.
-    Bytes reduceParts(Bytes&& mine, std::function<void(ByteReader&, ByteReader&, Bytes&)> combine)
+    // parts; `read` gets what follows it in the combined part of all ranks. Throws InvalidArgument if the ranks have
+    // made different calls.
+    void reduceParts(Bytes&& mine, std::function<void(ByteReader&, ByteReader&, Bytes&)> combine,
+                     FunctionRef<void(ByteReader&)> read)
     {
-        return reduce(std::move(mine), [combine = std::move(combine)](const Bytes& a, const Bytes& b) {
+        const Bytes all = reduce(std::move(mine), [combine = std::move(combine)](const Bytes& a, const Bytes& b) {
             ByteReader as(a), bs(b);
             const auto rankA = as.get<std::int32_t>(), rankB = bs.get<std::int32_t>();
             if (rankA < 0 || rankB < 0)
@@ -481,18 +486,13 @@ private:
             }
             return out;
         });
-    }
-
-    // Returns a reader of the combined part of all ranks, behind the call's name. Throws InvalidArgument if the ranks
-    // have made different calls.
-    ByteReader partIn(const Bytes& result) const
-    {
-        ByteReader in(result);
+        ByteReader in(all);
         const auto first = in.get<std::int32_t>();
         std::string call = in.getText();
         if (first < 0)
             throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, std::move(call)), connection_->throwByAll());
-        return in;
+        read(in);
+        in.end();
     }
 
     // A message that could not be read may have been a part of this reduction, if some ranks have not entered it yet,
@@ -609,17 +609,15 @@ private:
         case MessageKind::CreditRequest:
         case MessageKind::ImagePlace:
         case MessageKind::Leaving: return false;
-        default: return !isOwnReduction(kind, message) && !(isReduction(kind) && scopeOf(message) == quietScope);
+        case MessageKind::ReduceUp:
+        case MessageKind::ReduceDown: return !isOwnReduction(kind, message) && scopeOf(message) != quietScope;
+        default: return true;
         }
-    }
-    static bool isReduction(MessageKind kind)
-    {
-        return kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown;
     }
     // Whether a message is of reduce(), or of a reduction without a scope.
     static bool isOwnReduction(MessageKind kind, const Buffer& message)
     {
-        return isReduction(kind)
+        return (kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown)
                && (message.size() < sizeof(MessageHeader) + sizeof(std::uint32_t) || scopeOf(message) == ownScope);
     }
 
@@ -680,14 +678,6 @@ private:
         }
     }
 
-    void sendReduction(int destination, const ReductionKey& key, bool up, const Bytes& bytes)
-    {
-        Bytes body;
-        body.put(key.scope);
-        body.append(bytes.begin(), bytes.end());
-        send(destination, up ? MessageKind::ReduceUp : MessageKind::ReduceDown, key.number, body);
-    }
-
     void receive(int source, const MessageHeader& header, Buffer&& message) override
     {
         if (needsCredit(header.kind))
@@ -726,14 +716,12 @@ private:
                 checkLeft();
                 return;
             }
-            if (isReduction(a.header.kind)) {
+            if (isOwnReduction(a.header.kind, a.message)) {
                 if (a.message.size() < sizeof a.header + sizeof(std::uint32_t))
                     failMalformed("a reduction without a scope");
-                if (scopeOf(a.message) == ownScope) {
-                    requireCanBe(a.header);
-                    receiveReduction(a.source, a.header, a.message);
-                    return;
-                }
+                requireCanBe(a.header);
+                receiveReduction(a.source, a.header, a.message);
+                return;
             }
         } catch (const Error& e) {
             giveUp(a.source, e.info()); // whichever it was, some rank waits for it
@@ -751,8 +739,8 @@ private:
     {
         const std::int64_t begun = reductionCount_, number = header.number;
         const bool isLast = number >= 0 && number == begun - 1;
-        const bool isNext =
-            number == begun && header.kind == MessageKind::ReduceUp && !reductions_.isUnderWay({ownScope, begun - 1});
+        const bool isNext = number == begun && header.kind == MessageKind::ReduceUp
+                            && reductions_.missing({ownScope, begun - 1}).empty();
         if (!isLast && !isNext)
             failMalformed("a reduction that no rank can be at", begun, number);
     }

@@ -97,17 +97,12 @@ public:
         }
     }
 
-    bool isUnderWay(const ReductionKey& key)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return find(key) != nullptr;
-    }
-
-    // The message that this rank waits for: a part from a child, which stands for the ranks from the child to `last`;
-    // or, if all parts are here, the result from the parent, which has a lower rank.
+    // A message that this rank waits for in a reduction that it has entered: a part from a child, which stands for the
+    // ranks from the child to `last`; or, if all parts are here, the result from the parent, which has a lower rank.
     struct Missing {
         int rank, last;
     };
+    // Empty if the reduction is over.
     std::vector<Missing> missing(const ReductionKey& key)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -212,8 +207,7 @@ private:
         lock.unlock();
         for (auto child = children_.rbegin(); child != children_.rend(); ++child)
             send_(*child, key, false, result);
-        if (done)
-            done(result);
+        done(result);
     }
 
     int rank_, size_;
