@@ -1,8 +1,7 @@
 // ReductionTable: non-blocking all-reduce operations made of messages, along a binomial tree rooted at rank 0.
 //
 // Each reduction has a key. So any number of reductions may be under way, contributions may come before this rank takes
-// part, and contributions to an abandoned reduction are recognised. (A collective of the MPI library would have to be
-// entered by all ranks in the same order, even by a rank whose frame has failed.)
+// part, and contributions to an abandoned reduction are recognised.
 #pragma once
 
 #include <dfb/comm/message.hpp>
