@@ -98,8 +98,6 @@ public:
     {
         return std::shared_ptr<MemoryPool>(new MemoryPool(mayBeShared));
     }
-    MemoryPool(const MemoryPool&) = delete;
-    MemoryPool& operator=(const MemoryPool&) = delete;
     ~MemoryPool()
     {
         for (SizeClass& sizeClass : classes_)
