@@ -268,29 +268,25 @@ public:
         return whileThrown;
     }
 
-    // Each true is followed by one false; see Hurry and StandIn.
-    void hurry(bool more) { progress_.hurry(more); }
-    void standIn(bool more) { progress_.standIn(more); }
-
-    // Tells the connection something for as long as an object of this type exists.
-    template <void (Connection::*Tell)(bool)>
+    // Tells the progress thread something for as long as an object of this type exists.
+    template <void (ProgressThread::*Tell)(bool)>
     class Telling {
     public:
-        explicit Telling(Connection& connection) : connection_(connection) { (connection_.*Tell)(true); }
+        explicit Telling(Connection& connection) : progress_(connection.progress_) { (progress_.*Tell)(true); }
         Telling(const Telling&) = delete;
         Telling& operator=(const Telling&) = delete;
-        ~Telling() { (connection_.*Tell)(false); }
+        ~Telling() { (progress_.*Tell)(false); }
 
     private:
-        Connection& connection_;
+        ProgressThread& progress_;
     };
     // Messages may come.
-    using Expecting = Telling<&Connection::expectMessages>;
+    using Expecting = Telling<&ProgressThread::expectMessages>;
     // The connection looks for messages often.
-    using Hurry = Telling<&Connection::hurry>;
+    using Hurry = Telling<&ProgressThread::hurry>;
     // The calling thread moves messages in place of the progress thread, because it stays in calls that do so.
     // Otherwise the two threads, if they share a processor, would take turns for each message.
-    using StandIn = Telling<&Connection::standIn>;
+    using StandIn = Telling<&ProgressThread::standIn>;
 
     // For a thread that waits: moves messages in place of the progress thread, if there is one. Returns whether any
     // moved.
