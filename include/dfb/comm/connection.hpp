@@ -237,7 +237,7 @@ public:
     }
 
     // Notes that all ranks have the same configuration, `checksums` included. Before that, messages of the set-up may
-    // come with or without a checksum; see checkChecksum(). May be called any number of times.
+    // come with or without a checksum, so that ranks can say what differs. May be called any number of times.
     void setAlike() noexcept { isAlike_ = true; }
 
     // How many messages came twice and were dropped, since the last call.
@@ -359,9 +359,7 @@ private:
         return crc == 0 ? 1 : crc;
     }
 
-    // Whether ranks find out by messages of this kind whether they were set up alike, or that they cannot go on. A rank
-    // that uses checksums also reads such messages without one, and a rank that uses none reads those with one, so that
-    // both can say what differs.
+    // Whether ranks find out by messages of this kind whether they were set up alike, or that they cannot go on.
     static bool isOfSetUp(detail::MessageKind kind)
     {
         using Kind = detail::MessageKind;

@@ -128,7 +128,7 @@ public:
             last = &forgotten_.emplace_back(ReductionKey{scope, number});
         last->number = std::max(last->number, number);
         for (State& state : states_)
-            if (state.isUsed && state.key.scope == scope && state.key.number <= number)
+            if (state.key && state.key->scope == scope && state.key->number <= number)
                 state.reset();
     }
 
@@ -139,15 +139,14 @@ private:
     struct State {
         explicit State(std::size_t partCount) : parts(partCount) {}
 
-        ReductionKey key;
-        bool isUsed = false;
+        std::optional<ReductionKey> key; // none: not in use
         std::vector<std::optional<Bytes>> parts; // our own and the children's, by rank
         Combine combine;
         Done done;
 
         void reset()
         {
-            isUsed = false;
+            key.reset();
             for (auto& part : parts)
                 part.reset();
             combine = nullptr;
@@ -158,7 +157,7 @@ private:
     State* find(const ReductionKey& key)
     {
         for (State& state : states_)
-            if (state.isUsed && state.key == key)
+            if (state.key == key)
                 return &state;
         return nullptr;
     }
@@ -167,11 +166,10 @@ private:
     {
         State* state = find(key);
         for (std::size_t i = 0; !state && i < states_.size(); ++i)
-            state = states_[i].isUsed ? nullptr : &states_[i];
+            state = states_[i].key ? nullptr : &states_[i];
         if (!state)
             state = &states_.emplace_back(children_.size() + 1);
         state->key = key;
-        state->isUsed = true;
         return *state;
     }
 
@@ -193,14 +191,14 @@ private:
             finish(lock, state, result);
             return;
         }
-        const ReductionKey key = state.key;
+        const ReductionKey key = *state.key;
         lock.unlock();
         send_(parent(), key, true, result);
     }
 
     void finish(std::unique_lock<std::mutex>& lock, State& state, const Bytes& result)
     {
-        const ReductionKey key = state.key;
+        const ReductionKey key = *state.key;
         const Done done = std::move(state.done);
         state.reset();
         lock.unlock();
