@@ -57,7 +57,7 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         for (auto& [rank, peer] : peers_) {
-            free_ += peer.in.extra;
+            free_ += extraOf(peer.in, peer.in.granted);
             peer.reset(allowance_);
         }
         asking_.clear();
@@ -196,9 +196,10 @@ public:
     {
         std::unique_lock<std::mutex> lock(mutex_);
         Incoming& in = peerOf(source).in;
+        free_ += extraOf(in, in.granted);
         in.consumed += byteCount;
+        free_ -= extraOf(in, in.granted);
         inboxBytes_ -= byteCount;
-        updateExtra(in);
         // A Credit is not sent for every message. But the bytes that a sender has not been told of must stay below its
         // part of the pool, as it may be waiting for them.
         if (in.consumed - in.told >= allowance_ / 2)
@@ -244,7 +245,6 @@ private:
     struct Incoming {
         std::uint64_t granted = 0, consumed = 0; // totals
         std::uint64_t told = 0;                  // how much of `consumed` the sender was told
-        std::uint64_t extra = 0;                 // granted beyond the allowance and not consumed
         Request request;
 
         bool asks() const { return request.first > granted; } // once answered, it will ask again if it wants more
@@ -288,23 +288,18 @@ private:
         return out.request = request;
     }
 
+    // What of `granted` is beyond the allowance and not consumed.
     std::uint64_t extraOf(const Incoming& in, std::uint64_t granted) const
     {
         const std::uint64_t covered = in.consumed + allowance_;
         return granted > covered ? granted - covered : 0;
     }
 
-    void updateExtra(Incoming& in)
-    {
-        const std::uint64_t now = extraOf(in, in.granted);
-        free_ = free_ + in.extra - now;
-        in.extra = now;
-    }
-
     void grant(int source, Incoming& in, std::uint64_t total)
     {
+        free_ += extraOf(in, in.granted);
         in.granted = std::max(in.granted, total);
-        updateExtra(in);
+        free_ -= extraOf(in, in.granted);
         in.told = in.consumed;
         grants_.push({source, {in.granted, in.consumed}});
     }
@@ -317,7 +312,9 @@ private:
             const int source = asking_.front();
             Incoming& in = peerOf(source).in;
             if (in.asks()) {
-                const auto fits = [&](std::uint64_t total) { return extraOf(in, total) <= free_ + in.extra; };
+                const auto fits = [&](std::uint64_t total) {
+                    return extraOf(in, total) <= free_ + extraOf(in, in.granted);
+                };
                 if (fits(in.request.all))
                     grant(source, in, in.request.all);
                 else if (fits(in.request.first))
@@ -337,7 +334,7 @@ private:
 
     const std::size_t pool_, allowance_;
     mutable std::mutex mutex_;
-    std::size_t free_; // bytes of the half that is granted on request which are in nobody's `extra`
+    std::size_t free_; // bytes of the half that is granted on request which are in nobody's extraOf()
     // For each rank, from when it was first met:
     std::unordered_map<int, Peer> peers_;
     Fifo<int> asking_;
