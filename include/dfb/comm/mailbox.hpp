@@ -135,7 +135,11 @@ public:
             enqueue(destination, header, std::move(message));
             return;
         }
-        countSent(message); // now, so that the figures of the frame include it even if it has to wait
+        // Counts it now, so that the figures of the frame include it even if it has to wait.
+        bytesSent_ += static_cast<std::int64_t>(message.size());
+        ++messagesSent_;
+        if (carriesOn(header.kind, message))
+            ++sentOn_;
         if (needsCredit(header.kind))
             flow_.send(destination, std::move(message));
         else
@@ -590,14 +594,6 @@ private:
         --tasks_;
         if (isEnding_) // otherwise nobody waits for the end of a task itself
             changed_.notify_all();
-    }
-
-    void countSent(const Buffer& message)
-    {
-        bytesSent_ += static_cast<std::int64_t>(message.size());
-        ++messagesSent_;
-        if (carriesOn(loadAs<MessageHeader>(message.data()).kind, message))
-            ++sentOn_;
     }
 
     // Whether a message makes its receiver do something for its frame. Credit does not: it only releases waiting

@@ -139,7 +139,7 @@ private:
     struct State {
         explicit State(std::size_t partCount) : parts(partCount) {}
 
-        std::optional<ReductionKey> key; // none: not in use
+        std::optional<ReductionKey> key;         // none: not in use
         std::vector<std::optional<Bytes>> parts; // our own and the children's, by rank
         Combine combine;
         Done done;
