@@ -35,7 +35,8 @@ namespace detail {
 class MailboxOwner {
 public:
     // Takes a message. Called in tasks, for several messages at once and in any order. Messages of reductions come
-    // here, too, and the owner passes them on to receiveReduction(). Those of reduce() do not come here.
+    // here, too, and the owner passes them on to receiveReduction(). Those of reduce() do not come here. If it throws
+    // Error or std::bad_alloc, the connection fails.
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
     // A message of rank error.from could not be read. Nobody knows its kind, or which object it was for. If no frame
     // can fail because of it, the owner calls keepDamage().
@@ -710,23 +711,19 @@ private:
                     left_.push_back(left);
                 }
                 checkLeft();
-                return;
-            }
-            if (isOwnReduction(a.header.kind, a.message)) {
+            } else if (isOwnReduction(a.header.kind, a.message)) {
                 if (a.message.size() < sizeof a.header + sizeof(std::uint32_t))
                     failMalformed("a reduction without a scope");
                 requireCanBe(a.header);
                 receiveReduction(a.source, a.header, a.message);
-                return;
+            } else {
+                handler_.incoming(a.source, a.header, std::move(a.message));
             }
         } catch (const Error& e) {
             giveUp(a.source, e.info()); // whichever it was, some rank waits for it
-            return;
         } catch (const std::bad_alloc& e) {
             giveUp(a.source, errorInfo(ErrorKind::Transport, e.what()));
-            return;
         }
-        handler_.incoming(a.source, a.header, std::move(a.message));
     }
 
     // Checks the number of a message of reduce(). It must be that of the last reduction that this rank has begun, or of

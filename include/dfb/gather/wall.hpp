@@ -227,12 +227,9 @@ private:
             else
                 failMalformed("a message of a kind that no wall gets", -1, static_cast<std::int64_t>(header.kind));
         } catch (const Error& e) {
-            if (header.kind == MessageKind::FinishedTiles)
-                refuse(source, e.info(), header.number);
-            else // it may have been one that finish() waits for
-                mailbox_->giveUp(source, e.info());
-        } catch (const std::bad_alloc& e) { // the pool has memory for one frame only
-            mailbox_->giveUp(source, errorInfo(ErrorKind::Transport, e.what()));
+            if (header.kind != MessageKind::FinishedTiles)
+                throw; // it may have been one that finish() waits for
+            refuse(source, e.info(), header.number);
         }
     }
 
