@@ -404,27 +404,23 @@ private:
             return false;
         while (!peer.waiting.empty() && peer.inFlight < sendsPerPeer) {
             Buffer message = peer.waiting.pop();
-            const std::size_t byteCount = message.size();
-            if (lendsTo(destination) && byteCount >= MemoryPool::smallestShared) { // copying less is quicker
-                if (const std::byte* lent = pool_->lend(message)) {
-                    if (!packet_.hasRoom(0))
-                        sendPacket(destination);
-                    packet_.add({byteCount, ranks_.memory()->placeOf(lent), Record::Lent}, nullptr, 0);
-                    continue;
-                }
-            }
-            const bool isSmall = detail::PacketWriter::canHold(byteCount);
-            const std::size_t payloadBytes = isSmall ? byteCount : 0;
+            Record record{message.size(), 0, Record::Message};
+            const std::byte* lent = nullptr;
+            if (lendsTo(destination) && message.size() >= MemoryPool::smallestShared) // copying less is quicker
+                lent = pool_->lend(message);
+            if (lent)
+                record = {record.byteCount, ranks_.memory()->placeOf(lent), Record::Lent};
+            else if (!detail::PacketWriter::canHold(message.size()))
+                record = {record.byteCount, peer.tag % lastTag_ + 1, Record::Announcement};
+            const std::size_t payloadBytes = record.kind == Record::Message ? message.size() : 0;
             if (!packet_.hasRoom(payloadBytes))
                 sendPacket(destination);
-            if (isSmall) {
-                packet_.add({byteCount, 0, Record::Message}, message.data(), payloadBytes);
-                continue;
+            packet_.add(record, message.data(), payloadBytes);
+            if (record.kind == Record::Announcement) {
+                peer.tag = record.tag;
+                bodies_.push_back({std::move(message), 0, destination, record.tag});
+                ++peer.inFlight;
             }
-            peer.tag = peer.tag % lastTag_ + 1;
-            packet_.add({byteCount, peer.tag, Record::Announcement}, nullptr, 0);
-            bodies_.push_back({std::move(message), 0, destination, peer.tag});
-            ++peer.inFlight;
         }
         // Announcements first, so that the receiver is ready.
         sendPacket(destination);
