@@ -299,8 +299,7 @@ private:
         if (error.rank < 0 || error.rank == rank()) // else another rank has told all
             tellFailure(error.message);
         finishNotices();
-        if (handler_)
-            handler_->fail(error);
+        handler_->fail(error);
     }
 
     // Tells all other ranks, as far as possible: MPI itself may have failed.
@@ -499,14 +498,13 @@ private:
                         throw TransportError(
                             detail::printed("rank %d has lent a block that is not in the memory of this node", source),
                             rank());
-                    deliver(source, std::move(message));
+                    handler_->receive(source, std::move(message));
                 } else if (record.kind == Record::Failure) {
                     throw TransportError(std::string(reinterpret_cast<const char*>(payload), payloadBytes), source);
                 } else {
                     Buffer message = pool_->acquire(payloadBytes);
-                    if (payloadBytes > 0)
-                        std::memcpy(message.data(), payload, payloadBytes);
-                    deliver(source, std::move(message));
+                    std::memcpy(message.data(), payload, payloadBytes);
+                    handler_->receive(source, std::move(message));
                 }
             });
         if (!isPacket)
@@ -526,7 +524,7 @@ private:
             body.offset += static_cast<std::size_t>(body.count());
             if (body.offset < body.data.size())
                 return startReceive(body);
-            deliver(body.peer, std::move(body.data));
+            handler_->receive(body.peer, std::move(body.data));
             return MPI_REQUEST_NULL;
         });
     }
@@ -543,12 +541,6 @@ private:
         check(MPI_Irecv(body.data.data() + body.offset, body.count(), MPI_BYTE, body.peer, body.tag, comm(), &request),
               "MPI_Irecv", body.peer);
         return request;
-    }
-
-    void deliver(int source, Buffer&& message)
-    {
-        if (handler_)
-            handler_->receive(source, std::move(message));
     }
 
     std::size_t byteCountOf(const MPI_Status& status) const
@@ -605,9 +597,8 @@ private:
     bool moveUntil(detail::FunctionRef<bool()> done)
     {
         for (detail::Backoff backoff; !done();) {
-            if (handler_)
-                handler_->waiting();
-            if (handler_ && handler_->failed())
+            handler_->waiting();
+            if (handler_->failed())
                 return false;
             if (move())
                 backoff.reset();
@@ -711,7 +702,7 @@ private:
     detail::NoFinalize noFinalize_;
     std::shared_ptr<MemoryPool> pool_;
     detail::MpiRanks ranks_;
-    TransportHandler* handler_ = nullptr;
+    TransportHandler* handler_ = nullptr; // since start(), before which nothing is sent or received
     int lastTag_ = 1;
     int oversubscription_ = 4;
 
