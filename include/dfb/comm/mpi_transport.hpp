@@ -83,10 +83,8 @@ public:
     // True if any thread may call MPI while others do. Also false if MPI is not there: the constructor says why.
     static bool mayHaveThread(const Communicator&) noexcept
     {
-        int level = MPI_THREAD_SINGLE;
-        if (detail::mpiSays(MPI_Initialized) && !detail::mpiSays(MPI_Finalized))
-            MPI_Query_thread(&level);
-        return level == MPI_THREAD_MULTIPLE;
+        return detail::mpiSays(MPI_Initialized) && !detail::mpiSays(MPI_Finalized)
+               && detail::mpiLevel() == MPI_THREAD_MULTIPLE;
     }
 
     int rank() const noexcept { return ranks_.rank(); }
@@ -383,17 +381,12 @@ private:
         starting_.clear();
 
         bool any = false;
-        for (std::size_t i = 0; i < waitingPeers_.size();) {
-            const int destination = waitingPeers_[i];
+        const auto sendTo = [this, &any](int destination) {
             Peer& peer = peers_[static_cast<std::size_t>(destination)];
             any = startSends(destination, peer) || any;
-            if (peer.waiting.empty()) {
-                waitingPeers_[i] = waitingPeers_.back();
-                waitingPeers_.pop_back();
-            } else {
-                ++i;
-            }
-        }
+            return peer.waiting.empty();
+        };
+        waitingPeers_.erase(std::remove_if(waitingPeers_.begin(), waitingPeers_.end(), sendTo), waitingPeers_.end());
         return any;
     }
 
@@ -646,15 +639,14 @@ private:
     // Cancels the posted receives. Calls `came(packet, status)` for those that have got a packet before.
     void cancelPackets(detail::FunctionRef<void(const Transfer&, const MPI_Status&)> came)
     {
-        for (MPI_Request& request : packets_.requests)
-            if (request != MPI_REQUEST_NULL)
-                check(MPI_Cancel(&request), "MPI_Cancel");
         for (std::size_t i = 0; i < packets_.requests.size(); ++i) {
-            if (packets_.requests[i] == MPI_REQUEST_NULL)
+            MPI_Request& request = packets_.requests[i];
+            if (request == MPI_REQUEST_NULL)
                 continue;
             MPI_Status status;
             int cancelled = 0;
-            detail::waitMpi(packets_.requests[i], rank(), &status);
+            check(MPI_Cancel(&request), "MPI_Cancel");
+            detail::waitMpi(request, rank(), &status);
             check(MPI_Test_cancelled(&status, &cancelled), "MPI_Test_cancelled");
             if (!cancelled)
                 came(packets_.items[i], status);
