@@ -132,19 +132,19 @@ private:
     // Throws the same TransportError on all ranks.
     void compareFormats() const
     {
-        const std::vector<std::uint64_t> all = gather(std::uint64_t{packetFormat});
-        const auto differs = std::find_if(all.begin(), all.end(), [&](std::uint64_t f) { return f != all.front(); });
+        using Format = unsigned long long; // as printf() names it; of 8 bytes
+        const std::vector<Format> all = gather(Format{packetFormat});
+        const auto differs = std::find_if(all.begin(), all.end(), [&](Format f) { return f != all.front(); });
         if (differs == all.end())
             return;
         const int other = static_cast<int>(differs - all.begin());
-        const auto number = [](std::uint64_t format) { return static_cast<unsigned long long>(format); };
         std::string text = printed("ranks were built with versions of dfb that cannot read each other: rank 0 sends "
                                    "packets of format %llu",
-                                   number(all.front()));
+                                   all.front());
         int named = 0; // those that differ from rank 0
         for (std::size_t rank = 0; rank < all.size(); ++rank)
             if (all[rank] != all.front() && ++named <= 8)
-                text += printed(", rank %zu of format %llu", rank, number(all[rank]));
+                text += printed(", rank %zu of format %llu", rank, all[rank]);
         if (named > 8)
             text += printed(", and %d more of others than rank 0", named - 8);
         throw TransportError(std::move(text), other);
@@ -155,8 +155,6 @@ private:
         std::uint64_t host;
         Processors processors;
         NodeMemory::Address memory;
-
-        bool isOfNode(const Card& other) const { return host == other.host; }
     };
 
     // Finds the ranks of this node, and shares memory with those that it can be shared with.
@@ -170,18 +168,17 @@ private:
         });
         const std::vector<Card> all = gather(mine);
         sharingRanks_ = static_cast<int>(std::count_if(all.begin(), all.end(), [&](const Card& card) {
-            return card.isOfNode(mine) && card.processors.meets(mine.processors);
+            return card.host == mine.host && card.processors.meets(mine.processors);
         }));
 
         // Each tells the others whose memory it sees.
         std::vector<std::uint8_t> sees(all.size()), seen(all.size());
         attempt([&] {
-            for (std::size_t i = 0; i < all.size() && memory; ++i) {
-                if (static_cast<int>(i) == rank_ || !all[i].isOfNode(mine) || all[i].memory.process == 0)
-                    continue;
-                others_[i].itsMemory = NodeMemory::open(all[i].memory);
-                sees[i] = others_[i].itsMemory != nullptr;
-            }
+            for (std::size_t i = 0; i < all.size() && memory; ++i)
+                if (static_cast<int>(i) != rank_ && all[i].host == mine.host) {
+                    others_[i].itsMemory = NodeMemory::open(all[i].memory);
+                    sees[i] = others_[i].itsMemory != nullptr;
+                }
         });
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Ialltoall(sees.data(), 1, MPI_BYTE, seen.data(), 1, MPI_BYTE, comm_, &request), "MPI_Ialltoall");

@@ -129,19 +129,15 @@ public:
         if (file < 0)
             return nullptr;
         std::byte* base = ftruncate(file, static_cast<off_t>(capacity)) == 0 ? map(file) : nullptr;
-        if (!base || !allocate(file, base, 0, step)) {
-            unmap(base);
-            close(file);
-            return nullptr;
-        }
         std::shared_ptr<NodeMemory> memory(new NodeMemory(base, file));
-        if (getrandom(memory->address_.secret, sizeof memory->address_.secret, 0) < 0)
+        Address& address = memory->address_;
+        if (!base || !allocate(file, base, 0, step) || getrandom(address.secret, sizeof address.secret, 0) < 0)
             return nullptr;
-        for (std::uint64_t& word : memory->address_.secret)
+        for (std::uint64_t& word : address.secret)
             word |= 1;
-        memory->address_.process = getpid();
-        memory->address_.file = file;
-        std::memcpy(base, memory->address_.secret, sizeof memory->address_.secret);
+        address.process = getpid();
+        address.file = file;
+        std::memcpy(base, address.secret, sizeof address.secret);
         new (&memory->doorbell()) Doorbell;
         return memory;
 #else
@@ -154,8 +150,6 @@ public:
     static std::shared_ptr<NodeMemory> open(const Address& address)
     {
 #if defined(MFD_CLOEXEC)
-        if (address.process == 0)
-            return nullptr;
         const std::string path = "/proc/" + std::to_string(address.process) + "/fd/" + std::to_string(address.file);
         const int file = ::open(path.c_str(), O_RDWR | O_CLOEXEC);
         if (file < 0)
@@ -164,11 +158,8 @@ public:
         const bool fits = fstat(file, &status) == 0 && status.st_size == static_cast<off_t>(capacity);
         std::byte* base = fits ? map(file) : nullptr;
         close(file);
-        if (base && std::memcmp(base, address.secret, sizeof address.secret) != 0) {
-            unmap(base);
-            base = nullptr;
-        }
-        return base ? std::shared_ptr<NodeMemory>(new NodeMemory(base, -1)) : nullptr;
+        std::shared_ptr<NodeMemory> memory(new NodeMemory(base, -1));
+        return base && std::memcmp(base, address.secret, sizeof address.secret) == 0 ? memory : nullptr;
 #else
         (void)address;
         return nullptr;
