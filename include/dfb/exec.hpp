@@ -251,7 +251,6 @@ private:
 // runs the tasks of all of them, so that other ranks find room for their messages.
 class CallerExecutor final : public Executor {
 public:
-    CallerExecutor() = default;
     ~CallerExecutor() override
     {
         while (help()) {

@@ -6,7 +6,6 @@
 
 #include <chrono>
 #include <cstdint>
-#include <optional>
 
 DFB_NAMESPACE_BEGIN
 
@@ -53,33 +52,31 @@ namespace detail {
 // Reports the time from its construction to its destruction to a sink, if there is one.
 class TraceSpan {
 public:
-    TraceSpan(TraceSink* sink, TraceEvent::Kind kind, std::int64_t frame, std::int64_t tile = -1)
+    TraceSpan(TraceSink* sink, TraceEvent::Kind kind, std::int64_t frame, std::int64_t tile = -1) : sink_(sink)
     {
         if (!sink)
             return;
-        sink_ = sink;
-        event_.emplace();
-        event_->kind = kind;
-        event_->frame = frame;
-        event_->tile = static_cast<std::int32_t>(tile);
-        event_->begin = TraceEvent::Clock::now();
+        event_.kind = kind;
+        event_.frame = frame;
+        event_.tile = static_cast<std::int32_t>(tile);
+        event_.begin = TraceEvent::Clock::now();
     }
     TraceSpan(const TraceSpan&) = delete;
     TraceSpan& operator=(const TraceSpan&) = delete;
     ~TraceSpan()
     {
-        if (!event_)
+        if (!sink_)
             return;
-        event_->end = TraceEvent::Clock::now();
-        sink_->add(*event_);
+        event_.end = TraceEvent::Clock::now();
+        sink_->add(event_);
     }
 
     // The event, to be filled in. Null: there is no sink.
-    TraceEvent* event() noexcept { return event_ ? &*event_ : nullptr; }
+    TraceEvent* event() noexcept { return sink_ ? &event_ : nullptr; }
 
 private:
-    TraceSink* sink_ = nullptr;
-    std::optional<TraceEvent> event_;
+    TraceSink* const sink_;
+    TraceEvent event_;
 };
 
 } // namespace detail

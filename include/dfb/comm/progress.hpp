@@ -127,14 +127,10 @@ private:
                 polls = polls_;
                 between_(now);
             }
-            if (moved) {
+            if (moved)
                 last = now;
-                continue;
-            }
-            const Clock::duration idle = now - last;
-            if (idle < pollTime)
-                continue;
-            link_.nap(napAfter(idle, link_.quiet()));
+            if (const Clock::duration idle = now - last; idle >= pollTime)
+                link_.nap(napAfter(idle, link_.quiet()));
         }
     }
 
