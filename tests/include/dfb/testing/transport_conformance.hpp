@@ -170,15 +170,14 @@ private:
     struct End {
         End(Suite& suite, Mailbox& itsMailbox)
             : mailbox(itsMailbox), transport(suite.communicator_, suite.pool_, suite.mode_), channel(++suite.channels_),
-              polledHere(transport.needsPolling() && suite.mode_ == Progress::Caller),
-              polledByThread(transport.needsPolling() && suite.mode_ == Progress::Thread)
+              polledHere(transport.needsPolling() && suite.mode_ == Progress::Caller)
         {
         }
 
         Mailbox& mailbox;
         Transport transport;
         std::uint32_t channel;
-        bool polledHere, polledByThread;
+        bool polledHere;
         bool started = false, resting = false;
         bool mayFail = false; // a rank has left it, or will, and others may be told of a failure
         std::unique_ptr<Poller<Transport>> poller;
@@ -196,7 +195,7 @@ private:
     struct Peer {
         std::uint32_t step = 0;
         bool givesUp = false;
-        std::map<std::uint32_t, std::string> verdicts; // by step
+        std::map<std::uint32_t, std::string> verdicts; // by step; not empty
     };
     static constexpr std::uint32_t stepsPerCase = 1 << 16; // at least as many as ranks
 
@@ -236,7 +235,7 @@ private:
         std::string text = problems_.text();
         for (int r = 0; r < size_; ++r) {
             const auto verdict = peer(r).verdicts.find(step_);
-            if (text.empty() && verdict != peer(r).verdicts.end() && !verdict->second.empty())
+            if (text.empty() && verdict != peer(r).verdicts.end())
                 text = "rank " + std::to_string(r) + ": " + verdict->second;
             givesUp = givesUp || peer(r).givesUp;
         }
@@ -352,8 +351,7 @@ private:
         announce("", false);
         // This waits a little longer than for a message: the rank that misses a message has more to say than those that
         // wait for it.
-        await([this] { return allHaveCome(); }, [this] { return whoHasNotCome(options_.timeLimit); },
-              deadline_ + soon_);
+        await([this] { return allHaveCome(); }, [this] { return whoHasNotCome(options_.timeLimit); }, soon_);
     }
 
     // --- waiting
@@ -401,16 +399,11 @@ private:
     }
 
     // Waits until ready() is true. Throws GaveUp, with the text of what(), if it is not within the time limit of the
-    // case; and earlier if there is no more hope.
+    // case plus `longer`; and earlier if there is no more hope.
     template <class Ready, class What>
-    void await(const Ready& ready, const What& what)
+    void await(const Ready& ready, const What& what, Clock::duration longer = {})
     {
-        await(ready, what, deadline_);
-    }
-
-    template <class Ready, class What>
-    void await(const Ready& ready, const What& what, Clock::time_point deadline)
-    {
+        const Clock::time_point deadline = deadline_ + longer;
         std::string trouble;
         const auto over = [&] {
             trouble = hopeless();
@@ -461,7 +454,7 @@ private:
         end.mailbox.setInterrupt([&transport = end.transport] { transport.interrupt(); });
         end.transport.start(end.mailbox);
         end.started = true;
-        if (end.polledByThread)
+        if (end.transport.needsPolling() && !end.polledHere)
             end.poller = std::make_unique<Poller<Transport>>(end.transport);
     }
 
@@ -541,23 +534,27 @@ private:
         end.transport.send(destination, makeMessage(*pool_, own, options_.seed));
     }
 
-    // Sends `count` messages to each rank for which to(rank) is true.
-    template <class To>
-    void sendAll(End& end, const To& to, std::uint64_t count, const SizeOf& sizeOf)
+    // All other ranks, or half of them: in a round, the ranks of one parity send to those of the other.
+    enum class Others { All, OfOtherParity };
+    bool isIn(Others others, int r) const { return r != rank_ && (others == Others::All || r % 2 != rank_ % 2); }
+    bool sendsIn(int round) const { return rank_ % 2 == round % 2; }
+
+    // Sends the messages number `first`, `first` + `step`, ... below `count`.
+    void sendAll(End& end, Others to, std::uint64_t count, const SizeOf& sizeOf, std::uint64_t first = 0,
+                 std::uint64_t step = 1)
     {
-        for (std::uint64_t number = 0; number < count; ++number)
+        for (std::uint64_t number = first; number < count; number += step)
             for (int r = 0; r < size_; ++r)
-                if (r != rank_ && to(r))
+                if (isIn(to, r))
                     send(end, r, number, sizeOf(number));
     }
 
-    // Expects `count` messages from each rank for which from(rank) is true.
-    template <class From>
-    Ledger expect(const End& end, const From& from, std::uint64_t count, const SizeOf& sizeOf) const
+    // Expects `count` messages from each of these ranks.
+    Ledger expect(const End& end, Others from, std::uint64_t count, const SizeOf& sizeOf) const
     {
         std::vector<std::uint64_t> counts(static_cast<std::size_t>(size_));
         for (int r = 0; r < size_; ++r)
-            counts[static_cast<std::size_t>(r)] = r != rank_ && from(r) ? count : 0;
+            counts[static_cast<std::size_t>(r)] = isIn(from, r) ? count : 0;
         return Ledger(label(end), rank_, options_.seed, counts, sizeOf, options_.duplicatesAllowed);
     }
 
@@ -578,10 +575,6 @@ private:
         return static_cast<std::uint64_t>(std::max(1, size_ > 1 ? total / (size_ * (size_ - 1)) : 1));
     }
 
-    static bool everyone(int) { return true; }
-    // In a round the ranks of one parity send, the others receive.
-    bool isSender(int r, int round) const { return r % 2 == round % 2; }
-
     // --- cases
 
     void checkRanks()
@@ -596,8 +589,8 @@ private:
             throw GaveUp("mayPoll() forbids it to the thread that made the transport, with Progress::Caller");
         begin(*session_);
         meet(); // messages before start() have a case of their own
-        sendAll(*session_, everyone, 1, small);
-        Ledger ledger = expect(*session_, everyone, 1, small);
+        sendAll(*session_, Others::All, 1, small);
+        Ledger ledger = expect(*session_, Others::All, 1, small);
         receive(*session_, ledger);
     }
 
@@ -612,7 +605,7 @@ private:
                     && std::find(sizes.begin(), sizes.end(), size) == sizes.end())
                     sizes.push_back(size);
         const auto sizeOf = [&sizes](std::uint64_t number) { return sizes[static_cast<std::size_t>(number)]; };
-        Ledger ledger = expect(*session_, everyone, sizes.size(), sizeOf);
+        Ledger ledger = expect(*session_, Others::All, sizes.size(), sizeOf);
         for (int shift = 1; shift < size_; ++shift) {
             for (std::size_t i = 0; i < sizes.size(); ++i) { // small ones before and after large ones
                 const std::size_t number = i % 2 ? i / 2 : sizes.size() - 1 - i / 2;
@@ -635,10 +628,7 @@ private:
         std::atomic<int> running{threadCount};
         const auto sendOwn = [&](std::uint64_t first) {
             try {
-                for (std::uint64_t number = first; number < count; number += step)
-                    for (int r = 0; r < size_; ++r)
-                        if (r != rank_)
-                            send(*session_, r, number, sizeOf(number));
+                sendAll(*session_, Others::All, count, sizeOf, first, step);
             } catch (const std::exception& e) {
                 errors[static_cast<std::size_t>(first)] = e.what();
             }
@@ -647,7 +637,7 @@ private:
         // As in a connection that passes messages on.
         session_->mailbox.interruptOnReceive(true);
         meet();
-        Ledger ledger = expect(*session_, everyone, count, sizeOf);
+        Ledger ledger = expect(*session_, Others::All, count, sizeOf);
         if (threadCount == 1) {
             sendOwn(0);
         } else {
@@ -673,10 +663,10 @@ private:
         };
         rest(*session_, true);
         meet();
-        sendAll(*session_, everyone, count, sizeOf);
+        sendAll(*session_, Others::All, count, sizeOf);
         meet();
         rest(*session_, false);
-        Ledger ledger = expect(*session_, everyone, count, sizeOf);
+        Ledger ledger = expect(*session_, Others::All, count, sizeOf);
         receive(*session_, ledger);
     }
 
@@ -684,13 +674,11 @@ private:
     {
         for (int round = 0; round < 2; ++round) {
             ++series_;
-            const bool sends = isSender(rank_, round);
-            const auto others = [&](int r) { return isSender(r, round) != sends; };
-            Ledger ledger = expect(
-                *session_, [&](int r) { return !sends && others(r); }, 20, mixed());
+            const bool sends = sendsIn(round);
+            Ledger ledger = expect(*session_, Others::OfOtherParity, sends ? 0 : 20, mixed());
             meet();
             if (sends) {
-                sendAll(*session_, others, 20, mixed());
+                sendAll(*session_, Others::OfOtherParity, 20, mixed());
                 await([this] { return session_->transport.quiet(); },
                       [this] { return "quiet() has not come true within " + inSeconds(options_.timeLimit); });
                 rest(*session_, true);
@@ -777,18 +765,14 @@ private:
             return;
         for (int round = 0; round < 4; ++round) {
             ++series_;
-            const bool sends = isSender(rank_, round);
-            const auto others = [&](int r) { return isSender(r, round) != sends; };
-            Ledger ledger = expect(
-                *session_, [&](int r) { return !sends && others(r); }, 3, small);
+            const bool sends = sendsIn(round);
+            Ledger ledger = expect(*session_, Others::OfOtherParity, sends ? 0 : 3, small);
             session_->poller->napFor(sends ? longNap_ : Clock::duration::zero());
             meet();
             const auto before = Clock::now();
             for (std::uint64_t number = 0; sends && number < 3; ++number) {
                 idle(std::chrono::microseconds(number == 0 ? 10000 : 100)); // then in quick succession
-                for (int r = 0; r < size_; ++r)
-                    if (r != rank_ && others(r))
-                        send(*session_, r, number, small(number));
+                sendAll(*session_, Others::OfOtherParity, number + 1, small, number);
             }
             receive(*session_, ledger);
             if (const auto time = Clock::now() - before; time > soon_)
@@ -808,14 +792,12 @@ private:
     void checkEarlyMessages()
     {
         for (int round = 0; round < 2; ++round) {
-            const bool sends = isSender(rank_, round);
-            const auto others = [&](int r) { return isSender(r, round) != sends; };
+            const bool sends = sendsIn(round);
             End& end = make();
-            Ledger ledger = expect(
-                end, [&](int r) { return !sends && others(r); }, 20, mixed());
+            Ledger ledger = expect(end, Others::OfOtherParity, sends ? 0 : 20, mixed());
             if (sends) {
                 begin(end);
-                sendAll(end, others, 20, mixed());
+                sendAll(end, Others::OfOtherParity, 20, mixed());
                 idle(std::chrono::milliseconds(10)); // so that they leave, as far as they can
             }
             meet();
@@ -838,14 +820,14 @@ private:
             for (int shift = 1; shift < size_; ++shift)
                 for (End* end : {&first, &second})
                     send(*end, (rank_ + shift) % size_, number, mixed()(number));
-        Ledger ofFirst = expect(first, everyone, 50, mixed()), ofSecond = expect(second, everyone, 50, mixed());
+        Ledger ofFirst = expect(first, Others::All, 50, mixed()), ofSecond = expect(second, Others::All, 50, mixed());
         receive(second, ofSecond);
         receive(first, ofFirst);
         meet();
         close(first, true);
         ++series_;
-        sendAll(second, everyone, 5, small);
-        Ledger later = expect(second, everyone, 5, small);
+        sendAll(second, Others::All, 5, small);
+        Ledger later = expect(second, Others::All, 5, small);
         receive(second, later);
         meet();
         close(second, true);
@@ -858,8 +840,8 @@ private:
             End& end = make();
             begin(end);
             meet();
-            sendAll(end, everyone, 1, small);
-            Ledger ledger = expect(end, everyone, 1, small);
+            sendAll(end, Others::All, 1, small);
+            Ledger ledger = expect(end, Others::All, 1, small);
             const Ledger empty = ledger;
             kept.clear();
             await(
@@ -882,15 +864,13 @@ private:
     void checkOrderlyStop()
     {
         for (int round = 0; round < 2; ++round) {
-            const bool sends = isSender(rank_, round);
-            const auto others = [&](int r) { return isSender(r, round) != sends; };
+            const bool sends = sendsIn(round);
             End& end = make();
             begin(end);
-            Ledger ledger = expect(
-                end, [&](int r) { return !sends && others(r); }, 50, mixed());
+            Ledger ledger = expect(end, Others::OfOtherParity, sends ? 0 : 50, mixed());
             meet();
             if (sends)
-                sendAll(end, others, 50, mixed());
+                sendAll(end, Others::OfOtherParity, 50, mixed());
             else
                 receive(end, ledger);
             close(end, true); // the senders expect nothing
@@ -907,7 +887,7 @@ private:
         meet();
         if (rank_ == 0) {
             idle(std::chrono::milliseconds(20));
-            sendAll(end, everyone, 1, small);
+            sendAll(end, Others::All, 1, small);
         } else {
             end.poller.reset();
             end.mailbox.failWithMessage();
@@ -929,10 +909,10 @@ private:
         end.mayFail = true;
         begin(end);
         meet();
-        sendAll(end, everyone, 20, mixed());
-        if (isSender(rank_, 0)) { // some messages go to ranks that have left
+        sendAll(end, Others::All, 20, mixed());
+        if (sendsIn(0)) { // some messages go to ranks that have left
             idle(std::chrono::milliseconds(20));
-            sendAll(end, everyone, 20, mixed());
+            sendAll(end, Others::All, 20, mixed());
             idle(std::chrono::milliseconds(20));
         }
         const auto before = Clock::now();
