@@ -45,15 +45,7 @@ private:
 
     void run(std::size_t count, const std::function<void(std::size_t)>& body) override
     {
-        arena_.execute([&] {
-            tbb::parallel_for(
-                tbb::blocked_range<std::size_t>(0, count, 1),
-                [&](const tbb::blocked_range<std::size_t>& range) {
-                    for (std::size_t i = range.begin(); i != range.end(); ++i)
-                        body(i);
-                },
-                tbb::simple_partitioner());
-        });
+        arena_.execute([&] { tbb::parallel_for(std::size_t{0}, count, body, tbb::simple_partitioner()); });
     }
 
     tbb::task_arena arena_;
