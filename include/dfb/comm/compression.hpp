@@ -92,7 +92,7 @@ private:
     void begin(Phase phase)
     {
         phase_ = phase;
-        frames_ = 0;
+        frames_ = strange_ = 0;
     }
 
     void settle(bool mode)
@@ -100,7 +100,6 @@ private:
         mode_ = mode;
         usual_ = median(times_[mode]);
         interval_ = firstInterval;
-        strange_ = 0;
         begin(Phase::Settled);
     }
 
@@ -114,7 +113,6 @@ private:
         if (++frames_ < interval_ && strange_ < surprise)
             return;
         mine.erase(mine.begin(), mine.end() - static_cast<std::ptrdiff_t>(std::min(mine.size(), surprise)));
-        strange_ = 0;
         mode_ = !mode_;
         times_[mode_].clear();
         begin(Phase::Probe);

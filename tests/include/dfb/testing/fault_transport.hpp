@@ -129,12 +129,12 @@ public:
         FaultDecision decision;
         if (!options_.only || options_.only(destination, message))
             decision = decideFault(options_, rank(), destination, number);
-        if (decision.drop && takeLethal()) {
+        if (decision.drop && lethalLeft_-- > 0) {
             ++counts_->dropped;
             message = Buffer(); // the caller may keep the moved-from object alive
             return;
         }
-        if (decision.corrupt && !message.empty() && takeLethal()) {
+        if (decision.corrupt && !message.empty() && lethalLeft_-- > 0) {
             corrupt(message, decision.random);
             ++counts_->corrupted;
         }
@@ -225,14 +225,6 @@ private:
         std::uint64_t dueNumber; // also due once so many messages to the destination have been sent
     };
 
-    bool takeLethal()
-    {
-        if (lethalLeft_.fetch_sub(1) > 0)
-            return true;
-        ++lethalLeft_;
-        return false;
-    }
-
     static void corrupt(Buffer& message, std::uint64_t random)
     {
         const auto draw = [&random](std::size_t bound) { return (random = detail::scramble(random)) % bound; };
@@ -283,7 +275,7 @@ private:
     FaultOptions options_;
     std::shared_ptr<FaultCounts> counts_;
     std::vector<std::atomic<std::uint64_t>> numbers_; // of messages so far, per destination
-    std::atomic<int> lethalLeft_;
+    std::atomic<std::int64_t> lethalLeft_;            // none if negative
 
     std::mutex mutex_;
     std::vector<Held> held_;                // under mutex_
