@@ -23,6 +23,7 @@
 #include <dfb/compiled.hpp>
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <chrono>
 #include <cstddef>
@@ -683,10 +684,7 @@ private:
                 for (MPI_Request& request : *requests)
                     if (request != MPI_REQUEST_NULL && MPI_Cancel(&request) == MPI_SUCCESS)
                         MPI_Test(&request, &done, MPI_STATUS_IGNORE);
-        struct Abandoned {
-            Transfers sends, receives, notices, packets;
-        };
-        new Abandoned{std::move(sends_), std::move(receives_), std::move(notices_), std::move(packets_)};
+        new std::array<Transfers, 4>{std::move(sends_), std::move(receives_), std::move(notices_), std::move(packets_)};
         ranks_.abandon();
     }
 

@@ -8,7 +8,6 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
-#include <cstdint>
 #include <functional>
 #include <mutex>
 #include <thread>
@@ -58,7 +57,7 @@ public:
         if (!lock.owns_lock())
             return false;
         const bool moved = link_.poll();
-        ++polls_;
+        hasPolled_ = true;
         return moved;
     }
 
@@ -117,16 +116,13 @@ private:
         prctl(PR_SET_TIMERSLACK, 1000, 0, 0, 0); // in ns: the default would double the nap
 #endif
         auto last = Clock::now();
-        std::uint64_t polls = 0;
         while (!stop_) {
             if (hasStandIn())
                 standInLeft_.nap(std::chrono::milliseconds(2));
             const bool moved = tryPoll();
             const auto now = Clock::now();
-            if (polls_ != polls) {
-                polls = polls_;
+            if (hasPolled_.exchange(false))
                 between_(now);
-            }
             if (moved)
                 last = now;
             if (const Clock::duration idle = now - last; idle >= pollTime)
@@ -138,8 +134,8 @@ private:
     const Clock::duration longestNap_;
     const std::function<void(Clock::time_point)> between_;
     std::mutex pollMutex_;
-    std::atomic<std::uint64_t> polls_{0};
     std::atomic<bool> stop_{false};
+    std::atomic<bool> hasPolled_{false}; // since `between` was called
     std::atomic<int> expecting_{0}, waiting_{0}, standIns_{0};
     NapSignal standInLeft_;
     std::thread thread_;
