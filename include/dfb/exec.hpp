@@ -18,9 +18,7 @@
 
 DFB_NAMESPACE_BEGIN
 
-// The contract: submit() runs a task some time, on some worker, and never blocks; parallelFor() spreads a loop
-// over the workers and returns when all of it is done. Between two iterations of a loop a worker runs the tasks
-// that wait, so that compositing goes on beside rendering. Tasks must not wait for other tasks and must not throw.
+// Between two iterations of a loop a worker runs the tasks that wait, so that compositing goes on beside rendering.
 class Executor {
 public:
     using Task = std::function<void()>;
