@@ -35,16 +35,16 @@ public:
     };
     using Channel = std::vector<Endpoint>;
 
-    explicit InprocHub(int size) : size_(size), opened_(static_cast<std::size_t>(size)) {}
+    explicit InprocHub(int size) : opened_(static_cast<std::size_t>(size)) {}
 
-    int size() const noexcept { return size_; }
+    int size() const noexcept { return static_cast<int>(opened_.size()); }
 
     Channel& open(int rank)
     {
         std::lock_guard<std::mutex> lock(mutex_);
         const std::size_t index = opened_[static_cast<std::size_t>(rank)]++;
         if (index == channels_.size())
-            channels_.emplace_back(static_cast<std::size_t>(size_));
+            channels_.emplace_back(opened_.size());
         return channels_[index];
     }
 
@@ -58,27 +58,21 @@ public:
     // Tells all ranks that one of them has gone.
     void fail(const ErrorInfo& error)
     {
-        std::vector<Channel*> channels;
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            if (failure_)
-                return;
-            failure_ = error;
-            for (Channel& channel : channels_)
-                channels.push_back(&channel);
-        }
-        for (Channel* channel : channels)
-            for (Endpoint& endpoint : *channel) {
-                std::lock_guard<std::mutex> lock(endpoint.mutex);
+        std::lock_guard<std::mutex> lock(mutex_);
+        if (failure_)
+            return;
+        failure_ = error;
+        for (Channel& channel : channels_)
+            for (Endpoint& endpoint : channel) {
+                std::lock_guard<std::mutex> endpointLock(endpoint.mutex);
                 if (endpoint.handler)
                     endpoint.handler->fail(error);
             }
     }
 
 private:
-    int size_;
     std::mutex mutex_;
-    std::vector<std::size_t> opened_;
+    std::vector<std::size_t> opened_; // by each rank; under mutex_, but its size is fixed
     std::deque<Channel> channels_;
     std::optional<ErrorInfo> failure_;
 };
