@@ -12,12 +12,12 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
-#include <condition_variable>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <exception>
 #include <functional>
+#include <future>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -75,25 +75,16 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         results_.push_back(std::move(result));
     }
-    void finish()
-    {
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            finished_ = true;
-        }
-        changed_.notify_all();
-    }
 
-    // Returns false if a step has not ended in time. The last result then says so.
-    bool waitForEnd()
+    // Waits for the end of the suite. Returns false if a step has not ended in time. The last result then says so.
+    bool waitFor(const std::future<void>& end)
     {
-        std::unique_lock<std::mutex> lock(mutex_);
-        while (!finished_) {
+        while (end.wait_for(std::chrono::milliseconds(100)) != std::future_status::ready) {
+            const std::lock_guard<std::mutex> lock(mutex_);
             if (Clock::now() > until_) {
                 results_.push_back({activity_, "has not ended: a call of the transport does not return", true});
                 return false;
             }
-            changed_.wait_for(lock, std::chrono::milliseconds(100));
         }
         return true;
     }
@@ -105,11 +96,9 @@ public:
 
 private:
     mutable std::mutex mutex_;
-    std::condition_variable changed_;
     std::string activity_ = "constructor";
     Clock::time_point until_ = Clock::time_point::max();
     std::vector<ConformanceResult> results_;
-    bool finished_ = false;
 };
 
 // The cases, on one rank. All ranks go through them in step: they send announcements over a transport of the suite's
@@ -976,17 +965,20 @@ std::vector<ConformanceResult> checkTransport(const typename Transport::Communic
         } catch (const std::exception& e) {
             report->add({"start and end of the suite", e.what(), true});
         }
-        report->finish();
     };
     if (!suite->anyThread()) {
         run();
         return report->results();
     }
-    std::thread thread(run);
-    if (report->waitForEnd())
+    std::packaged_task<void()> task(run);
+    std::future<void> end = task.get_future();
+    std::thread thread(std::move(task));
+    if (report->waitFor(end)) {
         thread.join();
-    else
+        end.get(); // throws only what is no std::exception
+    } else {
         thread.detach();
+    }
     return report->results();
 }
 
