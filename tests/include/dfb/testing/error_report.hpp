@@ -32,9 +32,9 @@ struct ErrorReport {
     {
         ++values;
         const float rounded = toFloat(exact);
-        const bool same = ulpsBetween(measured, rounded) == 0;
+        std::int64_t distance = ulpsBetween(measured, rounded);
         if (!std::isfinite(measured) || !std::isfinite(rounded)) {
-            ++ulps[same || !std::isfinite(rounded) ? 0 : ulps.size() - 1];
+            ++ulps[distance == 0 || !std::isfinite(rounded) ? 0 : ulps.size() - 1];
             return;
         }
         const double error = std::abs(static_cast<double>(static_cast<Exact>(measured) - exact));
@@ -42,8 +42,7 @@ struct ErrorReport {
         sumSquares += error * error;
         peak = std::max(peak, std::abs(static_cast<double>(exact)));
         std::size_t bin = 0;
-        for (std::int64_t distance = ulpsBetween(measured, rounded); distance > 0 && bin + 1 < ulps.size();
-             distance /= 2)
+        for (; distance > 0 && bin + 1 < ulps.size(); distance /= 2)
             ++bin;
         ++ulps[bin];
     }
