@@ -7,11 +7,13 @@
 #include <dfb/render/shared_world.hpp>
 #include <dfb/render/visibility.hpp>
 #include <dfb/render/world.hpp>
+#include <dfb/tile.hpp>
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <exception>
+#include <memory>
 #include <numeric>
 #include <optional>
 #include <utility>
@@ -193,15 +195,16 @@ namespace detail {
 // exception of the camera has to come out of the frame, on all ranks: so set() keeps it for begin().
 class FromWorld {
 public:
-    // `isOrdered`: inputs come in an order that the loop was given, without depth.
+    // Sets config.order and config.owners. `isOrdered`: inputs come in an order that the loop was given, without depth.
     template <class FrameBuffer, class Camera>
     void set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
              bool isOrdered = false)
     {
         failure_ = nullptr;
         try {
-            if (!isOrdered)
-                order_.template set<FrameBuffer>(config, world, camera);
+            if constexpr (FrameBuffer::takesOrder && has_common_eye_v<Camera>)
+                if (!isOrdered)
+                    findOrder(config, world, camera.commonEye());
             findOwners(config, fb, world, camera, !isOrdered && !config.order);
         } catch (...) {
             failure_ = std::current_exception();
@@ -213,6 +216,23 @@ public:
     const std::exception_ptr& failure() const noexcept { return failure_; }
 
 private:
+    // Sets config.order if it is not set, all rays begin at `eye`, and the bricks have an order. The time grows with
+    // the square of the number of bricks, so it does nothing for more than 1024.
+    void findOrder(FrameConfig& config, const SharedWorld& world, const std::optional<Vec3>& eye)
+    {
+        const std::vector<SharedBrick>& bricks = world.bricks();
+        if (config.order || !eye || bricks.size() > 1024 || frontToBack_.find(world, *eye))
+            return;
+        sources_.clear();
+        for (const int brick : frontToBack_.order())
+            sources_.push_back(bricks[static_cast<std::size_t>(brick)].id);
+        if (!order_ || sources_ != orderSources_) {
+            order_ = std::make_shared<const SourceOrder>(sources_);
+            orderSources_ = sources_;
+        }
+        config.order = order_;
+    }
+
     // Sets config.owners, where ranks are on several nodes, unless it is set or the framebuffer has an owner map.
     // `hasDepth`: whether inputs have depth.
     template <class FrameBuffer, class Camera>
@@ -234,7 +254,9 @@ private:
         config.owners = owners_->find(fb.config(), hasDepth, [&](int tile) { return fb.tileOwner(tile); });
     }
 
-    BrickOrder order_;
+    FrontToBack frontToBack_;
+    std::vector<std::uint32_t> sources_, orderSources_; // orderSources_: of order_
+    std::shared_ptr<const SourceOrder> order_;
     std::optional<LinkOwners> owners_;
     std::exception_ptr failure_;
 };

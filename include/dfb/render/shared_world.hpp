@@ -5,13 +5,10 @@
 #include <dfb/base/detect.hpp>
 #include <dfb/compiled.hpp>
 #include <dfb/render/visibility.hpp>
-#include <dfb/tile.hpp>
 
 #include <algorithm>
 #include <cstddef>
-#include <cstdint>
 #include <cstring>
-#include <memory>
 #include <optional>
 #include <type_traits>
 #include <utility>
@@ -145,57 +142,24 @@ DFB_COMPILED_ONCE const char* FrontToBack::findAgain()
 DFB_COMPILED_ONCE FrontToBack::Before FrontToBack::before(std::size_t i, std::size_t j) const
 {
     const Box3 &a = boxes_[i], &b = boxes_[j];
-    bool apart = false, first = false, second = false;
-    const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e) {
-        if (aUpper <= bLower) { // a plane between, at any of [aUpper, bLower]
-            apart = true;
-            first = first || !(e > bLower);
-            second = second || !(e < aUpper);
-        }
-        if (bUpper <= aLower) {
-            apart = true;
-            first = first || !(e < bUpper);
-            second = second || !(e > aLower);
-        }
+    bool first = false, second = false; // may come first
+    const auto along = [&](float upper, float lower, float e, bool& lowerFirst, bool& upperFirst) {
+        if (upper > lower)
+            return; // no plane is between them
+        lowerFirst = lowerFirst || !(e > lower);
+        upperFirst = upperFirst || !(e < upper);
     };
-    alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye_.x);
-    alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye_.y);
-    alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye_.z);
-    if (!apart)
+    along(a.upper.x, b.lower.x, eye_.x, first, second);
+    along(b.upper.x, a.lower.x, eye_.x, second, first);
+    along(a.upper.y, b.lower.y, eye_.y, first, second);
+    along(b.upper.y, a.lower.y, eye_.y, second, first);
+    along(a.upper.z, b.lower.z, eye_.z, first, second);
+    along(b.upper.z, a.lower.z, eye_.z, second, first);
+    if (!first && !second)
         return Before::Overlaps;
-    return first == second ? Before::Either : first ? Before::First : Before::Second;
+    return first && second ? Before::Either : first ? Before::First : Before::Second;
 }
 #endif
-
-// Gives FrameConfig::order to the frames of a loop.
-class BrickOrder {
-public:
-    // Sets config.order if it is not set, the operation takes an order, it is known where the camera's rays begin, and
-    // the bricks have an order. The time grows with the square of the number of bricks, so it does nothing for more
-    // than 1024.
-    template <class FrameBuffer, class Camera>
-    void set(FrameConfig& config, const SharedWorld& world, const Camera& camera)
-    {
-        if constexpr (FrameBuffer::takesOrder && has_common_eye_v<Camera>) {
-            const std::optional<Vec3> eye = camera.commonEye();
-            if (config.order || !eye || world.bricks().size() > 1024 || bricks_.find(world, *eye))
-                return;
-            sources_.clear();
-            for (const int brick : bricks_.order())
-                sources_.push_back(world.bricks()[static_cast<std::size_t>(brick)].id);
-            if (!order_ || sources_ != last_) {
-                order_ = std::make_shared<const SourceOrder>(sources_);
-                last_ = sources_;
-            }
-            config.order = order_;
-        }
-    }
-
-private:
-    FrontToBack bricks_;
-    std::vector<std::uint32_t> sources_, last_;
-    std::shared_ptr<const SourceOrder> order_; // of last_
-};
 
 } // namespace detail
 

@@ -50,7 +50,8 @@ public:
     void cut(const Region& r)
     {
         region_ = intersection(region_, r);
-        region_ = region_.empty() ? Region{} : region_;
+        if (region_.empty())
+            region_ = {};
     }
 
     // The smallest rectangle of pixels around it.
@@ -80,10 +81,8 @@ DFB_COMPILED_ONCE Footprint::Footprint(std::vector<PixelPoint> points, double ma
         y0 = std::min(y0, p.y), y1 = std::max(y1, p.y);
     }
     const auto pixel = [](double v) { return static_cast<int>(std::floor(std::clamp(v, -1e6, 1e6))); };
-    const Region region{pixel(x0 - margin), pixel(y0 - margin), pixel(x1 + margin) + 1, pixel(y1 + margin) + 1};
-    region_ = intersection({0, 0, width, height}, region);
-    if (region_.empty())
-        region_ = {};
+    region_ = {0, 0, width, height};
+    cut({pixel(x0 - margin), pixel(y0 - margin), pixel(x1 + margin) + 1, pixel(y1 + margin) + 1});
 }
 
 DFB_COMPILED_ONCE bool Footprint::meets(const Region& r) const
@@ -168,12 +167,8 @@ inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
         failArgument(
             "the camera looks nowhere: its view has no length, `up` has none or is along the view, or a number "
             "is not finite");
-    Pose pose;
-    pose.eye = e;
-    pose.forward = normalize(v);
-    pose.right = normalize(side);
-    pose.up = cross(pose.right, pose.forward);
-    return pose;
+    const Vec3d forward = normalize(v), right = normalize(side);
+    return {e, forward, right, cross(right, forward)};
 }
 
 // Also throws InvalidArgument for an angle of view that is not in (0, 180) degrees.
