@@ -49,17 +49,8 @@ public:
     // also end well), and the destructor waits until all ranks have ended it.
     class [[nodiscard]] Frame {
     public:
-        Frame(Frame&& other) noexcept
-            : fb_(other.fb_), engine_(other.engine_), number_(other.number_),
-              isOpen_(std::exchange(other.isOpen_, false))
-        {
-        }
+        Frame(Frame&&) noexcept = default;
         Frame& operator=(Frame&&) = delete;
-        ~Frame()
-        {
-            if (isOpen_)
-                engine_->leave();
-        }
 
         // The number of the frame, as in FrameReport::frame. Any thread.
         std::int64_t number() const noexcept { return number_; }
@@ -263,8 +254,7 @@ public:
         FrameReport end()
         {
             requireOpen();
-            isOpen_ = false;
-            const FrameReport report = engine_->end();
+            const FrameReport report = open_.release()->end();
             fb_->lastEnded_ = engine_;
             return report;
         }
@@ -286,10 +276,16 @@ public:
 
     private:
         friend class DistributedFrameBuffer;
-        Frame(DistributedFrameBuffer* fb, Engine* engine) : fb_(fb), engine_(engine), number_(engine->frame()) {}
+        struct Leave {
+            void operator()(Engine* engine) const noexcept { engine->leave(); }
+        };
+        Frame(DistributedFrameBuffer* fb, Engine* engine)
+            : fb_(fb), engine_(engine), number_(engine->frame()), open_(engine)
+        {
+        }
         void requireOpen() const
         {
-            if (!isOpen_)
+            if (!open_)
                 detail::failArgument("frame %lld has ended, or its Frame was moved from",
                                      static_cast<long long>(number_));
             engine_->requireProgress();
@@ -297,7 +293,7 @@ public:
         DistributedFrameBuffer* fb_;
         Engine* engine_;
         std::int64_t number_;
-        bool isOpen_ = true;
+        std::unique_ptr<Engine, Leave> open_; // engine_, until this Frame has ended or was moved from
     };
 
     // Makes a connection over the communicator and a framebuffer on it. Collective. Waits for all ranks. Throws
