@@ -185,13 +185,11 @@ public:
             std::unique_ptr<DeepTile> deep = takeSpare();
             deep->reset(tile);
             renderBrick(brick, *deep);
-            const TileHeader header = tile;
             for (int layer = 0; layer == 0 || layer < deep->layers(); ++layer) {
                 if (layer > 0)
                     tile.clear();
-                static_cast<TileHeader&>(tile) = header;
                 tile.generation = layer == 0 ? 1 : 2;
-                tile.children = layer == 0 && deep->layers() > 1 ? deep->layers() - 1 : 0;
+                tile.children = layer == 0 ? std::max(deep->layers() - 1, 0) : 0;
                 tile.part = static_cast<std::uint16_t>(layer);
                 deep->writeLayer(layer, tile);
                 frame.setTile(tile);

@@ -142,10 +142,10 @@ private:
     {
         if (taken_[t] < config_.firstSamples)
             return config_.firstSamples;
-        if (error_[t] <= config_.maxError && config_.maxError > 0)
-            return taken_[t];
         if (config_.maxError == 0)
             return config_.maxSamples;
+        if (error_[t] <= config_.maxError)
+            return taken_[t];
         const double ratio = error_[t] / config_.maxError;
         const double needed = static_cast<double>(taken_[t]) * std::min(2.0, ratio * ratio);
         return static_cast<int>(std::min(std::ceil(needed), 2e9));
