@@ -32,7 +32,7 @@ public:
     }
 
     // On one node, any owner is as near to the pixels as another.
-    bool isOneNode() const { return ranksOf_.empty() || ranksOf_.front().size() == nodeOf_.size(); }
+    bool isOneNode() const { return ranksOf_.front().size() == nodeOf_.size(); }
 
     void start(const TileLayout& layout)
     {

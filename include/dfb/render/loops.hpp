@@ -16,6 +16,7 @@
 #include <memory>
 #include <numeric>
 #include <optional>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -45,17 +46,14 @@ InPlace<Find> inPlace(Find find)
 
 namespace detail {
 
+template <class Render>
+inline constexpr bool is_in_place_v = false;
+template <class Find>
+inline constexpr bool is_in_place_v<InPlace<Find>> = true;
+
 // The tile that a loop hands to a renderer.
 template <class FrameBuffer, class Render>
-struct TileOf {
-    using Type = typename FrameBuffer::Tile;
-};
-template <class FrameBuffer, class Find>
-struct TileOf<FrameBuffer, InPlace<Find>> {
-    using Type = typename FrameBuffer::TileView;
-};
-template <class FrameBuffer, class Render>
-using TileFor = typename TileOf<FrameBuffer, Render>::Type;
+using TileFor = std::conditional_t<is_in_place_v<Render>, typename FrameBuffer::TileView, typename FrameBuffer::Tile>;
 
 // A pass of an item, such as a pair of brick and tile.
 struct Job {
@@ -191,29 +189,27 @@ private:
 
 namespace detail {
 
-// Finds the order and the owners of a loop's frames from a SharedWorld and a camera. begin() needs them, but an
-// exception of the camera has to come out of the frame, on all ranks: so set() keeps it for begin().
+// Finds the order and the owners of a loop's frames from a SharedWorld and a camera.
 class FromWorld {
 public:
     // Sets config.order and config.owners. `isOrdered`: inputs come in an order that the loop was given, without depth.
+    // Returns the exception that the camera has thrown, or null. begin() has to get it, so that it comes out of the
+    // frame, on all ranks. Inputs of other ranks may be here already: without the order, they are not what this rank
+    // expects.
     template <class FrameBuffer, class Camera>
-    void set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
-             bool isOrdered = false)
+    std::exception_ptr set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
+                           bool isOrdered = false)
     {
-        failure_ = nullptr;
         try {
             if constexpr (FrameBuffer::takesOrder && has_common_eye_v<Camera>)
                 if (!isOrdered)
                     findOrder(config, world, camera.commonEye());
             findOwners(config, fb, world, camera, !isOrdered && !config.order);
+            return nullptr;
         } catch (...) {
-            failure_ = std::current_exception();
+            return std::current_exception();
         }
     }
-
-    // The exception that the camera threw in set(), or null. begin() has to get it, as inputs of other ranks may be
-    // here already: without the order, they are not what this rank expects.
-    const std::exception_ptr& failure() const noexcept { return failure_; }
 
 private:
     // Sets config.order if it is not set, all rays begin at `eye`, and the bricks have an order. The time grows with
@@ -258,7 +254,6 @@ private:
     std::vector<std::uint32_t> sources_, orderSources_; // orderSources_: of order_
     std::shared_ptr<const SourceOrder> order_;
     std::optional<LinkOwners> owners_;
-    std::exception_ptr failure_;
 };
 
 // The jobs of a rank that renders its own bricks, and its declaration.
@@ -322,9 +317,8 @@ public:
                                       const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
-        if (all_)
-            fromWorld_.set(params, fb_, *all_, camera);
-        auto frame = fb_.begin(params, tileData, pixelData, fromWorld_.failure());
+        const std::exception_ptr failure = all_ ? fromWorld_.set(params, fb_, *all_, camera) : nullptr;
+        auto frame = fb_.begin(params, tileData, pixelData, failure);
         bricks_.template forEach<RenderBrick>(fb_, frame, world_, camera, [&](const Brick& brick, auto& tile) {
             renderBrick(brick, tile);
             frame.setTile(tile);

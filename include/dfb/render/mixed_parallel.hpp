@@ -23,6 +23,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <exception>
 #include <mutex>
 #include <tuple>
 #include <type_traits>
@@ -334,8 +335,8 @@ public:
                                       const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
-        fromWorld_.set(params, fb_, world_, camera);
-        auto frame = fb_.begin(params, tileData, pixelData, fromWorld_.failure());
+        const std::exception_ptr failure = fromWorld_.set(params, fb_, world_, camera);
+        auto frame = fb_.begin(params, tileData, pixelData, failure);
         frame.guard([&] {
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             frame.expectLayers(work_.mostPerTile());
@@ -403,8 +404,8 @@ public:
                                       const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = false;
-        fromWorld_.set(params, fb_, world_, camera, true);
-        auto frame = fb_.begin(params, tileData, pixelData, fromWorld_.failure());
+        const std::exception_ptr failure = fromWorld_.set(params, fb_, world_, camera, true);
+        auto frame = fb_.begin(params, tileData, pixelData, failure);
         frame.guard([&] {
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             work_.sortFrontToBack(world_, order);
