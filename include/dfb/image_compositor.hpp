@@ -182,7 +182,7 @@ private:
     void makeEngine(const FrameBufferConfig& config);
     TileOwners findOwners();
     void begin(const FrameConfig& frame);
-    void send(const InputImage& image, int place, bool usesDepth);
+    void send(const InputImage& image, int place);
 
     std::shared_ptr<Connection> connection_;
     std::shared_ptr<ThreadExecutor> oneThread_; // made here, for a rank with one processor
@@ -454,7 +454,7 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
     try {
         if (frame.passes != 1 || frame.samples)
             detail::failArgument("a picture of images has one sample a pixel");
-        send(image, place, (engine_->sent() & depthChannel) != 0);
+        send(image, place);
     } catch (...) {
         engine_->abort(engine_->frame(), std::current_exception(), -1);
     }
@@ -488,18 +488,17 @@ DFB_COMPILED_ONCE FrameReport ImageCompositor::end()
 }
 
 // Declares and sends the tiles that the image covers at least in part.
-DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place, bool usesDepth)
+DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place)
 {
     const TileLayout& layout = engine_->layout();
-    const Region& given = image.region;
-    const bool isWhole = given.x0 == 0 && given.y0 == 0 && given.x1 == 0 && given.y1 == 0;
-    const Region region = isWhole ? Region{0, 0, layout.width(), layout.height()} : given;
+    const Region region = image.region == Region{} ? Region{0, 0, layout.width(), layout.height()} : image.region;
     if (region.x1 < region.x0 || region.y1 < region.y0)
         detail::failArgument("an image of columns %d to %d and rows %d to %d", region.x0, region.x1, region.y0,
                              region.y1);
     if (image.depth && !image.rgba8 && !image.rgba32f && !region.empty())
         detail::failArgument("an image with depth and without colour");
     const bool isThere = (image.rgba8 || image.rgba32f) && !region.empty();
+    const bool usesDepth = (engine_->sent() & depthChannel) != 0;
     if (isThere && usesDepth && !image.depth)
         detail::failArgument("an image without depth: %s", blend_ == ImageBlend::InOrder
                                                                ? "the picture is to have depth"
