@@ -434,13 +434,40 @@ public:
     }
 
 private:
+    // `mayWait`: puts the jobs aside of which another rank has not said yet whether it hides them.
     template <class RenderBrick>
     void renderJobs(typename FrameBuffer::Frame& frame, const RenderBrick& renderBrick, bool mayWait)
     {
-        frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(
-            static_cast<std::int64_t>(work_.jobs.size()), [&](std::int64_t i, auto& tile) {
-                renderJob(frame, work_.jobs[static_cast<std::size_t>(i)], renderBrick, tile, mayWait);
-            });
+        const std::vector<BrickInTile>& pairs = work_.pairs;
+        const auto count = static_cast<std::int64_t>(work_.jobs.size());
+        frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(count, [&](std::int64_t i, auto& tile) {
+            const detail::Job& job = work_.jobs[static_cast<std::size_t>(i)];
+            const BrickInTile& pair = pairs[job.item];
+            const Brick& brick = detail::brickOf(world_, pair);
+            const int generation = work_.generationOf(job);
+            if (frame.isHidden(pair.tile, generation)) {
+                work_.anyHidden = true;
+                return;
+            }
+            if (mayWait && frame.isUndecided(pair.tile, generation)) {
+                const std::lock_guard<std::mutex> lock(work_.undecidedMutex);
+                work_.undecided.push_back(job);
+                return;
+            }
+            frame.start(tile, pair.tile, job.pass);
+            tile.generation = generation;
+            tile.children = job.item + 1 < pairs.size() && pairs[job.item + 1].tile == pair.tile;
+            tile.source = brick.id;
+            try {
+                detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
+                frame.setTile(tile);
+            } catch (...) {
+                tellBehind(frame, job, false); // in a partial frame, others would wait to be told
+                throw;
+            }
+            if (tile.children > 0 && frame.opaqueHides(pair.tile))
+                tellBehind(frame, job, frame.hidesRest(tile));
+        });
     }
 
     // Renders the inputs that other ranks may hide, each as soon as those ranks have said that they do not.
@@ -465,57 +492,22 @@ private:
         }
     }
 
-    template <class RenderBrick, class Tile>
-    void renderJob(typename FrameBuffer::Frame& frame, const detail::Job& job, const RenderBrick& renderBrick,
-                   Tile& tile, bool mayWait)
-    {
-        const std::vector<BrickInTile>& pairs = work_.pairs;
-        const BrickInTile& pair = pairs[job.item];
-        const Brick& brick = detail::brickOf(world_, pair);
-        const int generation = work_.generationOf(job);
-        if (frame.isHidden(pair.tile, generation)) {
-            work_.anyHidden = true;
-            return;
-        }
-        if (mayWait && frame.isUndecided(pair.tile, generation)) {
-            const std::lock_guard<std::mutex> lock(work_.undecidedMutex);
-            work_.undecided.push_back(job);
-            return;
-        }
-        frame.start(tile, pair.tile, job.pass);
-        tile.generation = generation;
-        tile.children = job.item + 1 < pairs.size() && pairs[job.item + 1].tile == pair.tile;
-        tile.source = brick.id;
-        try {
-            detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
-            frame.setTile(tile);
-        } catch (...) {
-            tellBehind(frame, job, false); // in a partial frame, others would wait to be told
-            throw;
-        }
-        if (tile.children > 0 && frame.opaqueHides(pair.tile))
-            tellBehind(frame, job, frame.hidesRest(tile));
-    }
-
     // Tells the ranks behind an input that it hides theirs; or, if they wait to be told, that it does not.
     void tellBehind(typename FrameBuffer::Frame& frame, const detail::Job& job, bool hides)
     {
         const BrickInTile& pair = work_.pairs[job.item];
         const auto tile = static_cast<std::size_t>(pair.tile);
-        const bool isAwaited = work_.announced[tile] == pair.brick;
-        if (hides) {
+        if (!hides && work_.announced[tile] != pair.brick)
+            return; // nobody waits
+        if (hides)
             work_.anyHidden = true;
-            work_.hider[tile] = pair.brick;
-        } else if (isAwaited) {
-            work_.hider[tile] = -1;
-        }
-        if (hides || isAwaited)
-            work_.forEachRankBehind(world_, job, owner_, [&](int generation, int rank) {
-                if (hides)
-                    frame.hide(pair.tile, generation, rank);
-                else
-                    frame.show(pair.tile, generation, rank);
-            });
+        work_.hider[tile] = hides ? pair.brick : -1;
+        work_.forEachRankBehind(world_, job, owner_, [&](int generation, int rank) {
+            if (hides)
+                frame.hide(pair.tile, generation, rank);
+            else
+                frame.show(pair.tile, generation, rank);
+        });
     }
 
     FrameBuffer& fb_;
