@@ -47,11 +47,8 @@ struct MessageConfig {
 struct FrameBufferConfig {
     FrameBufferConfig() = default;
     FrameBufferConfig(int width, int height, OutputFormat format = OutputFormat::RGBA8, bool depth = false)
+        : image{width, height, format, depth}
     {
-        image.width = width;
-        image.height = height;
-        image.format = format;
-        image.depth = depth;
     }
 
     ImageConfig image;

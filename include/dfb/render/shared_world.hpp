@@ -84,10 +84,8 @@ public:
     const std::vector<int>& order() const noexcept { return order_; }
 
 private:
-    enum class Before { Either, First, Second, Overlaps };
-
     const char* findAgain();
-    Before before(std::size_t i, std::size_t j) const;
+    bool mayPrecede(const Box3& a, const Box3& b) const;
 
     std::vector<Box3> boxes_;
     Vec3 eye_;
@@ -118,18 +116,18 @@ DFB_COMPILED_ONCE const char* FrontToBack::findAgain()
     inFront_.assign(boxes_.size(), 0);
     for (std::size_t a = 0; a < boxes_.size(); ++a)
         for (std::size_t b = a + 1; b < boxes_.size(); ++b) {
-            const Before which = before(a, b);
-            if (which == Before::Overlaps)
+            const bool aFirst = mayPrecede(boxes_[a], boxes_[b]), bFirst = mayPrecede(boxes_[b], boxes_[a]);
+            if (!aFirst && !bFirst)
                 return "two bricks overlap: there is no order in which they could be blended";
-            if (which != Before::Either)
-                ++inFront_[which == Before::First ? b : a];
+            if (aFirst != bFirst)
+                ++inFront_[aFirst ? b : a];
         }
     for (std::size_t i = 0; i < boxes_.size(); ++i)
         if (inFront_[i] == 0)
             order_.push_back(static_cast<int>(i));
     for (std::size_t i = 0; i < order_.size(); ++i)
         for (std::size_t b = 0; b < boxes_.size(); ++b)
-            if (inFront_[b] > 0 && before(static_cast<std::size_t>(order_[i]), b) == Before::First
+            if (inFront_[b] > 0 && !mayPrecede(boxes_[b], boxes_[static_cast<std::size_t>(order_[i])])
                 && --inFront_[b] == 0)
                 order_.push_back(static_cast<int>(b));
     return order_.size() == boxes_.size()
@@ -139,25 +137,14 @@ DFB_COMPILED_ONCE const char* FrontToBack::findAgain()
 
 // If the eye is on one side of a plane between two boxes, or on the plane, the box on that side may come first. If no
 // ray crosses the plane, either may: the eye's coordinate is NaN then, and all comparisons are false.
-DFB_COMPILED_ONCE FrontToBack::Before FrontToBack::before(std::size_t i, std::size_t j) const
+DFB_COMPILED_ONCE bool FrontToBack::mayPrecede(const Box3& a, const Box3& b) const
 {
-    const Box3 &a = boxes_[i], &b = boxes_[j];
-    bool first = false, second = false; // may come first
-    const auto along = [&](float upper, float lower, float e, bool& lowerFirst, bool& upperFirst) {
-        if (upper > lower)
-            return; // no plane is between them
-        lowerFirst = lowerFirst || !(e > lower);
-        upperFirst = upperFirst || !(e < upper);
+    const auto along = [](float aLower, float aUpper, float bLower, float bUpper, float e) {
+        return (aUpper <= bLower && !(e > bLower)) || (bUpper <= aLower && !(e < bUpper));
     };
-    along(a.upper.x, b.lower.x, eye_.x, first, second);
-    along(b.upper.x, a.lower.x, eye_.x, second, first);
-    along(a.upper.y, b.lower.y, eye_.y, first, second);
-    along(b.upper.y, a.lower.y, eye_.y, second, first);
-    along(a.upper.z, b.lower.z, eye_.z, first, second);
-    along(b.upper.z, a.lower.z, eye_.z, second, first);
-    if (!first && !second)
-        return Before::Overlaps;
-    return first && second ? Before::Either : first ? Before::First : Before::Second;
+    return along(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye_.x)
+           || along(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye_.y)
+           || along(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye_.z);
 }
 #endif
 
