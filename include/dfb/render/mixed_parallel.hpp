@@ -284,7 +284,8 @@ struct OrderedWork : MixedWork {
     void forEachRankBehind(const SharedWorld& world, const Job& job, Owner& owner, const F& f) const
     {
         const int tile = pairs[job.item].tile;
-        std::vector<int> told;
+        static thread_local std::vector<int> told;
+        told.clear();
         for (std::size_t p = job.item + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
             const int rank = owner(brickOf(world, pairs[p]), tile, 0);
             if (std::find(told.begin(), told.end(), rank) != told.end())
