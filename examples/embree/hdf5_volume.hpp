@@ -222,49 +222,29 @@ inline VolumeSource openHdf5(const std::string& path, const Loaders& loaders = {
 {
     VolumeInfo info;
     bool isFloat = false;
-    std::shared_ptr<detail::Hdf5Volume> volume;
+    BoxReader read;
     const VoxelRange range = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
-        volume = std::make_shared<detail::Hdf5Volume>(path);
+        const auto volume = std::make_shared<detail::Hdf5Volume>(path);
         info.dims = volume->dims();
         info.type = volume->type();
         isFloat = volume->isFloat();
-        VoxelRange own;
+        read = [volume, counter = loaders.readCounter()](const Index3& lo, const Index3& hi, std::byte* out) {
+            volume->read(lo, {hi[0] - lo[0], hi[1] - lo[1], hi[2] - lo[2]}, out);
+            *counter += voxelsOfBox(lo, hi) * volume->fileBytes();
+        };
         if (info.type == VoxelType::UInt8)
             return std::vector<VoxelRange>{{0, 255, 0}};
-        const std::size_t rowVoxels = static_cast<std::size_t>(info.dims[0]);
-        const int most = std::max(1, static_cast<int>((1 << 18) / rowVoxels)); // rows at a time
-        std::vector<std::byte> rows;
-        const auto [first, end] =
-            loaders.shareOf(static_cast<std::uint64_t>(info.dims[1]) * static_cast<std::uint64_t>(info.dims[2]));
-        for (std::uint64_t row = first; row < end;) { // each time rows of one layer, or some of them
-            const int y = static_cast<int>(row % static_cast<std::uint64_t>(info.dims[1])),
-                      z = static_cast<int>(row / static_cast<std::uint64_t>(info.dims[1])),
-                      count = static_cast<int>(std::min<std::uint64_t>(
-                          static_cast<std::uint64_t>(std::min(most, info.dims[1] - y)), end - row));
-            const std::size_t voxels = rowVoxels * static_cast<std::size_t>(count);
-            rows.resize(voxels * voxelBytes(info.type));
-            volume->read({0, y, z}, {info.dims[0], count, 1}, rows.data());
-            own.grow(info.type, rows.data(), voxels);
-            *loaders.readCounter() += voxels * volume->fileBytes();
-            row += static_cast<std::uint64_t>(count);
-        }
-        return std::vector<VoxelRange>{own};
+        return std::vector<VoxelRange>{rangeOfShare(info.dims, info.type, read, loaders)};
     }));
     info.spacing = grid.spacing.value_or(info.spacing);
     info.origin = grid.origin.value_or(info.origin);
     setRange(info, range, isFloat, path);
+    if (isFloat)
+        read = finiteReader(std::move(read), info.minimum);
     VolumeSource source;
     source.name = path;
     source.info = info;
-    source.open = [volume, info, isFloat, counter = loaders.readCounter()] {
-        return [volume, info, isFloat, counter](const Index3& lo, const Index3& hi, std::byte* out) {
-            volume->read(lo, {hi[0] - lo[0], hi[1] - lo[1], hi[2] - lo[2]}, out);
-            const std::size_t voxels = voxelsOfBox(lo, hi);
-            *counter += voxels * volume->fileBytes();
-            if (isFloat)
-                replaceNotFinite(out, voxels, info.minimum);
-        };
-    };
+    source.open = [read] { return read; };
     lookInto(source, loaders, lookOf);
     return source;
 }

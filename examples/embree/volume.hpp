@@ -82,31 +82,6 @@ struct VolumeSource {
 
 // ---- files -----------------------------------------------------------------------------------------------------
 
-// The range of voxels [begin, end), in file order. Adds what it reads to `bytesRead`. `file` as findVoxels() left it.
-inline VoxelRange scanVoxels(std::istream& stream, const VolumeFile& file, std::uint64_t begin, std::uint64_t end,
-                             std::uint64_t& bytesRead)
-{
-    VoxelRange range;
-    const VoxelFormat& format = file.format;
-    const std::size_t size = format.bytes(), most = std::size_t{1} << 20;
-    std::vector<std::byte> chunk, converted;
-    stream.seekg(static_cast<std::streamoff>(begin * size) + file.begin);
-    while (begin < end) {
-        const std::size_t count = static_cast<std::size_t>(std::min<std::uint64_t>(most / size, end - begin));
-        chunk.resize(count * size);
-        if (!stream.read(reinterpret_cast<char*>(chunk.data()), static_cast<std::streamsize>(chunk.size())))
-            throw std::runtime_error(file.path + ": reading failed after " + std::to_string(begin * size) + " bytes");
-        if (!format.isAsInMemory()) {
-            converted.resize(count * voxelBytes(format.inMemory()));
-            format.convert(chunk.data(), count, converted.data());
-        }
-        range.grow(format.inMemory(), format.isAsInMemory() ? chunk.data() : converted.data(), count);
-        begin += count;
-        bytesRead += chunk.size();
-    }
-    return range;
-}
-
 // Sets the range over which the values of a whole volume are normalised. Throws std::runtime_error that begins with
 // `name`.
 inline void setRange(VolumeInfo& info, const VoxelRange& range, bool isFloat, const std::string& name)
@@ -136,42 +111,12 @@ inline std::size_t voxelsOfBox(const Index3& lo, const Index3& hi)
     return extent(0) * extent(1) * extent(2);
 }
 
-// Replaces infinities and NaN among `count` floats in memory.
-inline void replaceNotFinite(std::byte* voxels, std::size_t count, float replacement)
+// Reads voxels as they are in the file, except for their type. `file` as findVoxels() left it. Adds what it reads to
+// the counter, if there is one.
+inline BoxReader rawReader(std::shared_ptr<std::istream> stream, const VolumeFile& file,
+                           std::shared_ptr<std::uint64_t> bytesRead)
 {
-    for (std::size_t i = 0; i < count; ++i, voxels += sizeof(float)) {
-        float value;
-        std::memcpy(&value, voxels, sizeof value);
-        if (!std::isfinite(value))
-            std::memcpy(voxels, &replacement, sizeof value);
-    }
-}
-
-// Collective: calls findVoxels() on this rank's own stream and finds the range, for which each rank reads a share of
-// the voxels. Throws std::runtime_error, the same on all ranks.
-inline VolumeInfo describeVolume(std::istream& stream, VolumeFile& file, const Loaders& loaders = {})
-{
-    const VoxelRange range = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
-        findVoxels(stream, file);
-        if (file.format.type == FileType::UInt8)
-            return std::vector<VoxelRange>{{0, 255, 0}};
-        const auto [begin, end] = loaders.shareOf(file.voxelCount());
-        return std::vector<VoxelRange>{scanVoxels(stream, file, begin, end, *loaders.readCounter())};
-    }));
-    VolumeInfo info;
-    info.dims = file.dims;
-    info.type = file.format.inMemory();
-    info.spacing = file.spacing;
-    info.origin = file.origin;
-    setRange(info, range, file.format.isFloat(), file.path);
-    return info;
-}
-
-// Reads from a stream that describeVolume() has accepted. Adds what it reads to the counter, if there is one.
-inline BoxReader boxReader(std::shared_ptr<std::istream> stream, const VolumeFile& file, const VolumeInfo& info,
-                           std::shared_ptr<std::uint64_t> bytesRead = nullptr)
-{
-    return [stream, file, minimum = info.minimum, bytesRead, position = std::streamoff(-1),
+    return [stream, file, bytesRead, position = std::streamoff(-1),
             stored = std::vector<std::byte>()](const Index3& lo, const Index3& hi, std::byte* out) mutable {
         const VoxelFormat& format = file.format;
         const bool areWhole = lo[0] == 0 && hi[0] == file.dims[0]; // whole rows, which follow one another
@@ -195,11 +140,74 @@ inline BoxReader boxReader(std::shared_ptr<std::istream> stream, const VolumeFil
                     *bytesRead += bytes;
                 if (!format.isAsInMemory())
                     format.convert(stored.data(), voxels, out);
-                if (format.isFloat())
-                    replaceNotFinite(out, voxels, minimum);
                 out += voxels * voxelBytes(format.inMemory());
             }
     };
+}
+
+// Reads floats, with `minimum` in place of infinities and NaN.
+inline BoxReader finiteReader(BoxReader read, float minimum)
+{
+    return [read = std::move(read), minimum](const Index3& lo, const Index3& hi, std::byte* out) {
+        read(lo, hi, out);
+        const std::size_t voxels = voxelsOfBox(lo, hi);
+        for (std::size_t i = 0; i < voxels; ++i, out += sizeof(float)) {
+            float value;
+            std::memcpy(&value, out, sizeof value);
+            if (!std::isfinite(value))
+                std::memcpy(out, &minimum, sizeof value);
+        }
+    };
+}
+
+// Reads from a stream that describeVolume() has accepted. Adds what it reads to the counter, if there is one.
+inline BoxReader boxReader(std::shared_ptr<std::istream> stream, const VolumeFile& file, const VolumeInfo& info,
+                           std::shared_ptr<std::uint64_t> bytesRead = nullptr)
+{
+    const BoxReader read = rawReader(std::move(stream), file, std::move(bytesRead));
+    return file.format.isFloat() ? finiteReader(read, info.minimum) : read;
+}
+
+// The range of this rank's share of the rows.
+inline VoxelRange rangeOfShare(const Index3& dims, VoxelType type, const BoxReader& read, const Loaders& loaders)
+{
+    VoxelRange range;
+    std::vector<std::byte> voxels;
+    const int most = std::max(1, (1 << 18) / dims[0]); // rows at a time
+    const auto rowsOfLayer = static_cast<std::uint64_t>(dims[1]);
+    const auto [first, end] = loaders.shareOf(rowsOfLayer * static_cast<std::uint64_t>(dims[2]));
+    for (std::uint64_t row = first; row < end;) { // each time rows of one layer, or some of them
+        const int y = static_cast<int>(row % rowsOfLayer), z = static_cast<int>(row / rowsOfLayer);
+        const int rows = static_cast<int>(
+            std::min<std::uint64_t>(static_cast<std::uint64_t>(std::min(most, dims[1] - y)), end - row));
+        const Index3 lo{0, y, z}, hi{dims[0], y + rows, z + 1};
+        voxels.resize(voxelsOfBox(lo, hi) * voxelBytes(type));
+        read(lo, hi, voxels.data());
+        range.grow(type, voxels.data(), voxelsOfBox(lo, hi));
+        row += static_cast<std::uint64_t>(rows);
+    }
+    return range;
+}
+
+// Collective: calls findVoxels() on this rank's own stream and finds the range, for which each rank reads a share of
+// the voxels. Throws std::runtime_error, the same on all ranks.
+inline VolumeInfo describeVolume(const std::shared_ptr<std::istream>& stream, VolumeFile& file,
+                                 const Loaders& loaders = {})
+{
+    VolumeInfo info;
+    const VoxelRange range = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
+        findVoxels(*stream, file);
+        info.dims = file.dims;
+        info.type = file.format.inMemory();
+        if (info.type == VoxelType::UInt8)
+            return std::vector<VoxelRange>{{0, 255, 0}};
+        const BoxReader read = rawReader(stream, file, loaders.readCounter());
+        return std::vector<VoxelRange>{rangeOfShare(info.dims, info.type, read, loaders)};
+    }));
+    info.spacing = file.spacing;
+    info.origin = file.origin;
+    setRange(info, range, file.format.isFloat(), file.path);
+    return info;
 }
 
 // The value of a voxel.
@@ -288,19 +296,7 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
 inline std::array<float, 2> rangeOf(const VolumeSource& source, const Loaders& loaders = {})
 {
     const VoxelRange all = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
-        const VolumeInfo& info = source.info;
-        const BoxReader read = source.open();
-        const std::size_t count = static_cast<std::size_t>(info.dims[0]);
-        std::vector<std::byte> row(count * voxelBytes(info.type));
-        VoxelRange range;
-        const auto rows = static_cast<std::uint64_t>(info.dims[1]);
-        const auto [begin, end] = loaders.shareOf(rows * static_cast<std::uint64_t>(info.dims[2]));
-        for (std::uint64_t i = begin; i < end; ++i) {
-            const int y = static_cast<int>(i % rows), z = static_cast<int>(i / rows);
-            read({0, y, z}, {info.dims[0], y + 1, z + 1}, row.data());
-            range.grow(info.type, row.data(), count);
-        }
-        return std::vector<VoxelRange>{range};
+        return std::vector<VoxelRange>{rangeOfShare(source.info.dims, source.info.type, source.open(), loaders)};
     }));
     return {all.lo, all.hi};
 }
@@ -355,7 +351,7 @@ inline VolumeSource openVolume(const std::string& path, const Loaders& loaders =
     VolumeSource source;
     source.name = path;
     source.notes = file.notes;
-    source.info = describeVolume(*open(), file, loaders);
+    source.info = describeVolume(open(), file, loaders);
     source.open = [open, file, info = source.info, counter = loaders.readCounter()] {
         return boxReader(open(), file, info, counter);
     };

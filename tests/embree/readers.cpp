@@ -35,17 +35,15 @@ std::string bytesOf(const std::vector<T>& values)
 
 VolumeInfo describe(const std::string& name, const std::string& bytes)
 {
-    std::istringstream stream(bytes);
     VolumeFile file = parseVolumeName(name);
-    return describeVolume(stream, file);
+    return describeVolume(std::make_shared<std::istringstream>(bytes), file);
 }
 
 VolumeSource sourceOf(const std::string& name, const std::string& bytes)
 {
     VolumeSource source;
-    std::istringstream stream(bytes);
     VolumeFile file = parseVolumeName(name);
-    source.info = describeVolume(stream, file);
+    source.info = describeVolume(std::make_shared<std::istringstream>(bytes), file);
     source.open = [bytes, file, info = source.info] {
         return boxReader(std::make_shared<std::istringstream>(bytes), file, info);
     };

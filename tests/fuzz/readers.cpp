@@ -141,8 +141,7 @@ void checkVolume(const std::string& bytes)
     VolumeFile described;
     try {
         described = parseVolumeName(file);
-        std::istringstream stream(voxels);
-        source.info = describeVolume(stream, described);
+        source.info = describeVolume(std::make_shared<std::istringstream>(voxels), described);
     } catch (const std::runtime_error& e) {
         fuzz::require(std::string(e.what()).compare(0, file.size() + 2, file + ": ") == 0, "the error names the file");
         return;
@@ -161,8 +160,7 @@ void checkHeader(const std::string& bytes, VolumeFile (*parse)(std::istream&, co
         fuzz::require(isUsable(described.spacing) && described.spacing.x > 0, "a spacing is usable");
         if (described.data != name)
             return;
-        std::istringstream whole(bytes);
-        source.info = describeVolume(whole, described);
+        source.info = describeVolume(std::make_shared<std::istringstream>(bytes), described);
     } catch (const std::runtime_error& e) {
         fuzz::require(std::string(e.what()).compare(0, name.size() + 2, name + ": ") == 0, "the error names the file");
         return;
