@@ -81,8 +81,13 @@ inline std::vector<CellSurfaces> exchangeBricks(Scene& scene, const std::vector<
         return all;
     const int ranks = loaders.size();
     std::vector<Loaders::Bytes> parts(static_cast<std::size_t>(ranks) + 1);
-    const auto send = [&](std::size_t cell, const auto& pieces) {
-        for (const auto& piece : pieces) {
+    const auto send = [&](const auto& object, const Box& box) { // which holds all of its primitives
+        for (std::size_t cell = 0; cell < holders.size(); ++cell) {
+            if (!box.overlaps(reaches[cell]))
+                continue;
+            const auto piece = detail::partIn(object, reaches[cell]);
+            if (piece.primitives.empty())
+                continue;
             const Holders& held = holders[cell];
             if (held.count >= ranks)
                 detail::pack(static_cast<std::uint32_t>(cell), piece, parts.back());
@@ -98,13 +103,7 @@ inline std::vector<CellSurfaces> exchangeBricks(Scene& scene, const std::vector<
                 Box box;
                 for (const Vec3& p : object.mesh.positions)
                     box.grow(p);
-                for (std::size_t cell = 0; cell < holders.size(); ++cell) {
-                    if (!box.overlaps(reaches[cell]))
-                        continue;
-                    std::vector<BrickMesh> pieces;
-                    detail::addMesh(pieces, object, reaches[cell]);
-                    send(cell, pieces);
-                }
+                send(object, box);
                 object.mesh = Mesh();
                 object.normals = {};
             }
@@ -113,13 +112,7 @@ inline std::vector<CellSurfaces> exchangeBricks(Scene& scene, const std::vector<
                 Box box;
                 for (const Sphere& sphere : object.spheres)
                     box.grow(sphere.center, sphere.radius);
-                for (std::size_t cell = 0; cell < holders.size(); ++cell) {
-                    if (!box.overlaps(reaches[cell]))
-                        continue;
-                    std::vector<BrickSpheres> pieces;
-                    detail::addSpheres(pieces, object, reaches[cell]);
-                    send(cell, pieces);
-                }
+                send(object, box);
                 object.spheres = {};
             }
         return std::vector<char>();

@@ -40,7 +40,6 @@ struct BrickSpheres {
 };
 
 struct Brick {
-    std::uint32_t id = 0;
     Box cell; // half-open
     std::vector<BrickVolume> volumes;
     std::vector<BrickMesh> meshes;
@@ -59,10 +58,9 @@ inline void addVolume(Brick& brick, const VolumeObject& object)
         return;
     const float rounding = object.rotation.isNone() ? 0.01f : 0.25f; // in voxels; see VolumeSampler::toVoxel()
     Index3 lo, hi;
-    for (int i = 0; i < 3; ++i) {
-        const float offset = component(object.placement.offset, i), scale = component(object.placement.scale, i);
-        const std::size_t axis = static_cast<std::size_t>(i);
-        const float low = component(part.lo, i), high = component(part.hi, i);
+    for (std::size_t axis = 0; axis < 3; ++axis) {
+        const float offset = component(object.placement.offset, axis), scale = component(object.placement.scale, axis);
+        const float low = component(part.lo, axis), high = component(part.hi, axis);
         const float first = scale > 0 ? low : high, behind = scale > 0 ? high : low;
         const int last = object.source.info.dims[axis] - 1;
         // Gradients in a cell use one voxel before its first voxel, and two voxels behind.
@@ -96,7 +94,8 @@ inline BrickSpheres emptyPartOf(const SphereObject& object)
     return part;
 }
 
-inline void addMesh(std::vector<BrickMesh>& meshes, const MeshObject& object, const Box& reach)
+// The primitives of an object that touch a box; there may be none.
+inline BrickMesh partIn(const MeshObject& object, const Box& reach)
 {
     BrickMesh part = emptyPartOf(object);
     const std::uint32_t none = ~std::uint32_t{0};
@@ -123,11 +122,9 @@ inline void addMesh(std::vector<BrickMesh>& meshes, const MeshObject& object, co
         part.mesh.triangles.push_back(renamed);
         part.primitives.push_back(object.firstPrimitive + static_cast<std::uint32_t>(i));
     }
-    if (!part.primitives.empty())
-        meshes.push_back(std::move(part));
+    return part;
 }
-
-inline void addSpheres(std::vector<BrickSpheres>& spheres, const SphereObject& object, const Box& reach)
+inline BrickSpheres partIn(const SphereObject& object, const Box& reach)
 {
     BrickSpheres part = emptyPartOf(object);
     for (std::size_t i = 0; i < object.spheres.size(); ++i) {
@@ -138,8 +135,7 @@ inline void addSpheres(std::vector<BrickSpheres>& spheres, const SphereObject& o
             part.primitives.push_back(object.firstPrimitive + static_cast<std::uint32_t>(i));
         }
     }
-    if (!part.primitives.empty())
-        spheres.push_back(std::move(part));
+    return part;
 }
 
 } // namespace detail
@@ -157,20 +153,21 @@ inline Box reachOf(const Scene& scene, const Box& cell, float ghosts)
 // Loads a rank's part of the scene for one cell. Volumes are read from their source here, and only as far as needed;
 // the scene itself can go when all bricks are loaded. The parts of meshes and spheres that ranks have read together
 // come by exchangeBricks().
-inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell, float ghosts = 0)
+inline Brick loadBrick(const Scene& scene, const Box& cell, float ghosts = 0)
 {
     Brick brick;
-    brick.id = id;
     brick.cell = cell;
     const Box reach = reachOf(scene, cell, ghosts);
     for (const VolumeObject& object : scene.volumes)
         detail::addVolume(brick, object);
-    for (const MeshObject& object : scene.meshes)
-        if (!object.isPart)
-            detail::addMesh(brick.meshes, object, reach);
-    for (const SphereObject& object : scene.spheres)
-        if (!object.isPart)
-            detail::addSpheres(brick.spheres, object, reach);
+    const auto add = [&reach](const auto& objects, auto& parts) {
+        for (const auto& object : objects)
+            if (!object.isPart)
+                if (auto part = detail::partIn(object, reach); !part.primitives.empty())
+                    parts.push_back(std::move(part));
+    };
+    add(scene.meshes, brick.meshes);
+    add(scene.spheres, brick.spheres);
     return brick;
 }
 

@@ -116,12 +116,11 @@ RankScene loadRankScene(const Options& options, const Loaders& loaders)
         const Holders& held = holders[static_cast<std::size_t>(brick)]; // those of all its cells
         if ((rank - held.first + rankCount) % rankCount >= held.count)
             continue;
-        const auto id = static_cast<std::uint32_t>(brick);
-        result.brickIds.push_back(id);
+        result.brickIds.push_back(static_cast<std::uint32_t>(brick));
         result.renderers.emplace_back();
         for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size();
              c += static_cast<std::size_t>(brickCount)) {
-            Brick loaded = loadBrick(scene, id, cells[c], ghosts);
+            Brick loaded = loadBrick(scene, cells[c], ghosts);
             std::move(surfaces[c].meshes.begin(), surfaces[c].meshes.end(), std::back_inserter(loaded.meshes));
             std::move(surfaces[c].spheres.begin(), surfaces[c].spheres.end(), std::back_inserter(loaded.spheres));
             surfaces[c] = CellSurfaces();

@@ -134,7 +134,7 @@ Picture render(const Scene& scene, const example::RenderSettings& settings, cons
         if (run.bricks == 0) {
             dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::InprocTransport> fb(communicator,
                                                                                                      config);
-            const example::Renderer renderer(loadBrick(scene, 0, scene.bounds), info, settings);
+            const example::Renderer renderer(loadBrick(scene, scene.bounds), info, settings);
             keep(fb, dfb::ImageParallelLoop(fb).render([&](auto& tile) { renderer.renderTile(tile, 0); }, params));
             return;
         }
@@ -149,7 +149,7 @@ Picture render(const Scene& scene, const example::RenderSettings& settings, cons
             const Box& c = cells[id];
             world.add({id, {{c.lo.x, c.lo.y, c.lo.z}, {c.hi.x, c.hi.y, c.hi.z}}});
             const float ghosts = run.ghosts ? ghostReach(info, settings) : 0;
-            renderers[id] = std::make_unique<example::Renderer>(loadBrick(scene, id, c, ghosts), info, settings);
+            renderers[id] = std::make_unique<example::Renderer>(loadBrick(scene, c, ghosts), info, settings);
         }
         const example::FrameCamera camera = frameCamera(info, settings, 0);
         keep(fb, dfb::DataParallelLoop(fb, world).render(
@@ -373,7 +373,7 @@ TEST_CASE("Bricks that are cut by content take equally long", "[cut]")
         const example::SceneInfo info(scene);
         std::vector<double> most(static_cast<std::size_t>(settings.frames)), all = most;
         for (const Box& cell : cells) {
-            const example::Renderer renderer(loadBrick(scene, 0, cell, ghostReach(info, settings)), info, settings);
+            const example::Renderer renderer(loadBrick(scene, cell, ghostReach(info, settings)), info, settings);
             auto tile = std::make_unique<dfb::Tile<dfb::colorChannel | dfb::depthChannel, 128>>();
             tile->region = {0, 0, settings.width, settings.height};
             for (std::size_t frame = 0; frame < all.size(); ++frame) {
@@ -476,9 +476,8 @@ TEST_CASE("A brick holds its part of the volume, with ghosts, and no more", "[cu
     };
     const std::vector<Box> cells = cutScene(scene, 8);
     for (std::uint32_t id = 0; id < 8; ++id) {
-        const example::Brick brick = loadBrick(scene, id, cells[id]);
+        const example::Brick brick = loadBrick(scene, cells[id]);
         REQUIRE(brick.volumes.size() == 1);
-        CHECK(brick.id == id);
         const example::VoxelBlock& block = brick.volumes[0].block;
         CHECK(count(block) >= 66u * 66u * 66u);
         CHECK(count(block) <= 72u * 72u * 72u); // of 128^3
@@ -502,7 +501,7 @@ TEST_CASE("A brick holds its part of the volume, with ghosts, and no more", "[cu
     Box aside;
     aside.lo = {5, 5, 5};
     aside.hi = {6, 6, 6};
-    CHECK(loadBrick(scene, 0, aside).volumes.empty());
+    CHECK(loadBrick(scene, aside).volumes.empty());
 }
 
 TEST_CASE("A brick holds the triangles and spheres that touch it, under their numbers in the whole scene", "[cut]")
@@ -513,7 +512,7 @@ TEST_CASE("A brick holds the triangles and spheres that touch it, under their nu
     std::vector<int> seenTriangles(triangles.size()), seenSpheres(spheres.size());
     const std::vector<Box> cells = cutScene(scene, 8);
     for (std::uint32_t id = 0; id < 8; ++id) {
-        const example::Brick brick = loadBrick(scene, id, cells[id]);
+        const example::Brick brick = loadBrick(scene, cells[id]);
         std::set<std::uint32_t> here, spheresHere;
         for (const auto& part : brick.meshes) {
             CHECK(part.geometry == scene.meshes[0].geometry);
@@ -558,7 +557,7 @@ TEST_CASE("Each hit of a ray belongs to one brick", "[cut]")
         for (const int count : {2, 3, 8}) {
             INFO(count << " bricks");
             const auto surfacesOf = [&](const Box& cell) {
-                example::Brick brick = loadBrick(scene, 0, cell);
+                example::Brick brick = loadBrick(scene, cell);
                 return std::make_unique<example::Surfaces>(cell, std::move(brick.meshes), std::move(brick.spheres));
             };
             const auto whole = surfacesOf(scene.bounds);

@@ -148,7 +148,7 @@ TEST_CASE("No kind of camera cuts off a scene by default", "[framing]")
         if (!scene.volumes.empty())
             continue; // a volume has no surface that a ray would hit
         const example::SceneInfo info(scene);
-        example::Brick brick = loadBrick(scene, 0, scene.bounds);
+        example::Brick brick = loadBrick(scene, scene.bounds);
         const example::Surfaces surfaces(scene.bounds, std::move(brick.meshes), std::move(brick.spheres));
         std::vector<example::Hit> hits;
         for (const auto& [width, height] : sizes)

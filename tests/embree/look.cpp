@@ -40,7 +40,7 @@ std::unique_ptr<Tile> render(const Scene& scene, const Box& cell, const RenderSe
     auto tile = std::make_unique<Tile>();
     tile->region = {0, 0, 64, 64};
     tile->clear();
-    Renderer(loadBrick(scene, 0, cell, ghostReach(SceneInfo(scene), settings)), SceneInfo(scene), settings)
+    Renderer(loadBrick(scene, cell, ghostReach(SceneInfo(scene), settings)), SceneInfo(scene), settings)
         .renderTile(*tile, 0);
     return tile;
 }

@@ -52,7 +52,7 @@ struct Picture {
 Picture render(const Scene& scene, const Box& cell, const Scene& all, const example::RenderSettings& settings)
 {
     const example::SceneInfo info(all);
-    const example::Renderer renderer(loadBrick(scene, 0, cell, ghostReach(info, settings)), info, settings);
+    const example::Renderer renderer(loadBrick(scene, cell, ghostReach(info, settings)), info, settings);
     Picture picture;
     picture.tile->region = {0, 0, size, size};
     picture.tile->clear();
@@ -246,7 +246,7 @@ TEST_CASE("The first hits of a ray are those of all", "[opaque]")
     meshes.add(wall(0.5f), false); // twice at one place
     const Scene scenes[] = {spheres, meshes, thickScene()};
     for (const Scene& scene : scenes) {
-        example::Brick brick = loadBrick(scene, 0, scene.bounds);
+        example::Brick brick = loadBrick(scene, scene.bounds);
         const example::Surfaces surfaces(scene.bounds, std::move(brick.meshes), std::move(brick.spheres));
         std::vector<example::Hit> all, first;
         std::size_t seen = 0, wrong = 0;

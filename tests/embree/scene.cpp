@@ -139,7 +139,7 @@ TEST_CASE("The colours of vertices are in the image, cut or whole", "[scene]")
         auto tile = std::make_unique<Tile>();
         tile->region = {0, 0, 64, 64};
         tile->clear();
-        Renderer(loadBrick(scene, 0, cell), info, settings).renderTile(*tile, 0);
+        Renderer(loadBrick(scene, cell), info, settings).renderTile(*tile, 0);
         return tile;
     };
     const auto whole = render(scene.bounds);

@@ -208,7 +208,7 @@ void check(const std::string& file, int frame, bool isShared)
     const float ghosts = 0.02f;
     std::vector<Primitives> bricks;
     for (const Box& cell : expected.cells) {
-        const Brick brick = loadBrick(alone, 0, cell, ghosts);
+        const Brick brick = loadBrick(alone, cell, ghosts);
         bricks.emplace_back();
         add(bricks.back(), brick.meshes, brick.spheres);
     }

@@ -80,7 +80,7 @@ void checkMesh(const Mesh& mesh)
     const Scene scene = sceneWith(mesh);
     std::vector<bool> seen(mesh.triangles.size());
     for (const Box& cell : cutScene(scene, 3)) {
-        const Brick brick = loadBrick(scene, 0, cell);
+        const Brick brick = loadBrick(scene, cell);
         for (const BrickMesh& part : brick.meshes)
             for (const std::uint32_t primitive : part.primitives)
                 seen.at(primitive) = true;
