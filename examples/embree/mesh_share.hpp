@@ -26,7 +26,6 @@ struct MeshShare {
 struct MeshPart {
     Mesh mesh;
     std::vector<std::uint32_t> vertices; // the number of each in the whole mesh, ascending
-    std::uint32_t firstTriangle = 0;
 };
 
 // Collective: deals out the mesh of rank 0 in shares. What the other ranks give is ignored.
@@ -176,7 +175,6 @@ inline MeshPart partOf(MeshShare& share, const VertexLookup& lookup, const Verte
 {
     MeshPart part;
     part.vertices = vertices.list();
-    part.firstTriangle = static_cast<std::uint32_t>(share.firstTriangle);
     part.mesh.positions = lookup.of(share.mesh.positions);
     part.mesh.colors = lookup.of(share.mesh.colors);
     part.mesh.triangles = std::move(share.mesh.triangles);

@@ -161,7 +161,7 @@ struct Scene {
         MeshPart part = partOf(share, lookup, vertices);
         MeshObject object = placed(part.mesh, fit, look, name, loaders);
         object.normals = normalsOf(part, share.vertexBegins, lookup, loaders);
-        object.firstPrimitive = part.firstTriangle;
+        object.firstPrimitive = static_cast<std::uint32_t>(share.firstTriangle);
         object.isPart = loaders.size() > 1;
         object.mesh = std::move(part.mesh);
         meshes.push_back(std::move(object));
