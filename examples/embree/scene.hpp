@@ -186,15 +186,13 @@ struct Scene {
                     }
             },
             loaders);
-        requireAnyOf(seen, name, box);
-        noteSteps(name, box);
+        accept(seen, name, box);
         for (Sphere& sphere : share.spheres) {
             sphere.center = place.toWorld(sphere.center);
             sphere.radius *= place.size();
             if (look.color)
                 sphere.color = *look.color;
         }
-        grow(seen);
         spheres.push_back({nextGeometry_++, std::move(share.spheres), look.opacity, clipOf(look, place),
                            static_cast<std::uint32_t>(share.first), loaders.size() > 1});
     }
@@ -256,11 +254,9 @@ private:
                     }
             },
             loaders);
-        requireAnyOf(seen, name, box);
-        noteSteps(name, box);
+        accept(seen, name, box);
         for (Vec3& p : mesh.positions)
             p = place.toWorld(p);
-        grow(seen);
         return object;
     }
 
@@ -283,10 +279,14 @@ private:
                         + (lo == hi ? "all voxels are " + textOf(lo)
                                     : "all voxels, from " + textOf(lo) + " to " + textOf(hi) + ", are transparent"));
     }
-    // Coordinates are float32, whose steps grow with the distance from 0: adds a note if they can be seen. `box`: the
-    // file's box in its own coordinates.
-    void noteSteps(const std::string& name, const Box& box)
+    // Adds what is seen of a file to the bounds; throws if that is nothing. `box`: the file's box in its own
+    // coordinates. These are float32, whose steps grow with the distance from 0: adds a note if they can be seen.
+    void accept(const Box& seen, const std::string& name, const Box& box)
     {
+        if (seen.empty() && !box.empty())
+            throw std::runtime_error(name + ": the clip box leaves nothing of it; it goes from " + textOf(box.lo)
+                                     + " to " + textOf(box.hi));
+        grow(seen);
         float step = 0;
         for (const Vec3& corner : {box.lo, box.hi})
             for (int axis = 0; axis < 3 && !box.empty(); ++axis) {
@@ -298,13 +298,6 @@ private:
             notes.push_back(name + ": its coordinates, from " + textOf(box.lo) + " to " + textOf(box.hi)
                             + ", were rounded to steps of " + textOf(step)
                             + ", as float32 has them: subtract the position of its centre to see more");
-    }
-    // Throws if nothing of a file is seen in the world. `box` is the file's box in its own coordinates.
-    static void requireAnyOf(const Box& seen, const std::string& name, const Box& box)
-    {
-        if (seen.empty() && !box.empty())
-            throw std::runtime_error(name + ": the clip box leaves nothing of it; it goes from " + textOf(box.lo)
-                                     + " to " + textOf(box.hi));
     }
     template <class Take>
     static void takeCorners(const Box& part, const FileToWorld& place, const Take& take)
