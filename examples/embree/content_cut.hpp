@@ -27,10 +27,9 @@ public:
         : bounds_(scene.bounds)
     {
         const double extent = static_cast<double>(bounds_.largestExtent());
-        for (int axis = 0; axis < 3; ++axis) {
+        for (std::size_t axis = 0; axis < 3; ++axis) {
             const double length = static_cast<double>(component(bounds_.extent(), axis));
-            size_[static_cast<std::size_t>(axis)] =
-                std::max<std::size_t>(1, static_cast<std::size_t>(std::lround(finest * length / extent)));
+            size_[axis] = std::max<std::size_t>(1, static_cast<std::size_t>(std::lround(finest * length / extent)));
         }
         std::vector<double> content = surfaceContent(scene, loaders);
         for (double& amount : content)
@@ -72,11 +71,11 @@ private:
     std::size_t indexOf(std::size_t x, std::size_t y, std::size_t z) const { return (z * size_[1] + y) * size_[0] + x; }
 
     // The position of a world coordinate on the grid.
-    double onGrid(float world, int axis) const
+    double onGrid(float world, std::size_t axis) const
     {
         const double lo = static_cast<double>(component(bounds_.lo, axis)),
                      extent = static_cast<double>(component(bounds_.extent(), axis));
-        const double cells = static_cast<double>(size_[static_cast<std::size_t>(axis)]);
+        const double cells = static_cast<double>(size_[axis]);
         return std::clamp((static_cast<double>(world) - lo) / extent * cells, 0.0, cells);
     }
 
@@ -122,11 +121,10 @@ private:
     {
         std::array<std::size_t, 3> first{}, last{};
         std::array<std::array<double, 2>, 3> ends{};
-        for (int axis = 0; axis < 3; ++axis) {
-            const std::size_t a = static_cast<std::size_t>(axis);
-            ends[a] = {onGrid(component(box.lo, axis), axis), onGrid(component(box.hi, axis), axis)};
-            first[a] = std::min(static_cast<std::size_t>(ends[a][0]), size_[a] - 1);
-            last[a] = std::min(static_cast<std::size_t>(ends[a][1]), size_[a] - 1);
+        for (std::size_t axis = 0; axis < 3; ++axis) {
+            ends[axis] = {onGrid(component(box.lo, axis), axis), onGrid(component(box.hi, axis), axis)};
+            first[axis] = std::min(static_cast<std::size_t>(ends[axis][0]), size_[axis] - 1);
+            last[axis] = std::min(static_cast<std::size_t>(ends[axis][1]), size_[axis] - 1);
         }
         const auto part = [&](std::size_t axis, std::size_t i) { // part of the box in grid cell `i` along an axis
             const auto [lo, hi] = ends[axis];
@@ -155,11 +153,9 @@ private:
                     const Index3 at{x, y, z};
                     for (const int upper : {0, 1}) {
                         Vec3 p;
-                        for (int axis = 0; axis < 3; ++axis) {
-                            const std::size_t a = static_cast<std::size_t>(axis);
+                        for (std::size_t axis = 0; axis < 3; ++axis)
                             component(p, axis) = static_cast<float>(
-                                std::min((at[a] + upper) * visible.width[a], object.source.info.dims[a] - 1));
-                        }
+                                std::min((at[axis] + upper) * visible.width[axis], object.source.info.dims[axis] - 1));
                         block.grow(object.placement.toWorld(p));
                     }
                     block = intersection(block, object.upright());
@@ -183,9 +179,8 @@ private:
                                / static_cast<double>(settings.view.zoom);
         const double aspect = static_cast<double>(settings.width) / settings.height;
         Vec3 cell;
-        for (int axis = 0; axis < 3; ++axis)
-            component(cell, axis) =
-                component(bounds_.extent(), axis) / static_cast<float>(size_[static_cast<std::size_t>(axis)]);
+        for (std::size_t axis = 0; axis < 3; ++axis)
+            component(cell, axis) = component(bounds_.extent(), axis) / static_cast<float>(size_[axis]);
         const double radius = 0.5 * static_cast<double>(length(cell));
         const bool isDome = settings.view.kind == CameraKind::Dome;
         std::vector<double> sums((size_[0] + 1) * (size_[1] + 1) * (size_[2] + 1));
@@ -267,7 +262,7 @@ private:
     }
 
     struct Cut {
-        int axis = 0;
+        std::size_t axis = 0;
         double at = 0;
     };
 
@@ -285,23 +280,21 @@ private:
     static std::pair<Grid, Grid> halves(const Grid& box, const Cut& cut)
     {
         Grid a = box, b = box;
-        a.hi[static_cast<std::size_t>(cut.axis)] = b.lo[static_cast<std::size_t>(cut.axis)] = cut.at;
+        a.hi[cut.axis] = b.lo[cut.axis] = cut.at;
         return {a, b};
     }
 
     // In world units.
-    double lengthOf(const Grid& box, int axis) const
+    double lengthOf(const Grid& box, std::size_t axis) const
     {
-        const std::size_t i = static_cast<std::size_t>(axis);
-        return (box.hi[i] - box.lo[i]) / static_cast<double>(size_[i])
+        return (box.hi[axis] - box.lo[axis]) / static_cast<double>(size_[axis])
                * static_cast<double>(component(bounds_.extent(), axis));
     }
 
     // The best cut along an axis.
-    Cut balanced(const Grid& box, int axis, int lower, int upper) const
+    Cut balanced(const Grid& box, std::size_t axis, int lower, int upper) const
     {
-        const std::size_t i = static_cast<std::size_t>(axis);
-        double first = box.lo[i], last = box.hi[i];
+        double first = box.lo[axis], last = box.hi[axis];
         const double extent = last - first;
         first += extent / 64;
         last -= extent / 64;
@@ -330,7 +323,7 @@ private:
         }
         const int lower = count / 2, upper = count - lower;
         std::pair<Cut, double> found{{}, std::numeric_limits<double>::infinity()};
-        for (int axis = 0; axis < 3; ++axis) {
+        for (std::size_t axis = 0; axis < 3; ++axis) {
             if (lengthOf(box, axis) < thinnest * std::max({lengthOf(box, 0), lengthOf(box, 1), lengthOf(box, 2)}))
                 continue;
             const Cut cut = balanced(box, axis, lower, upper);
@@ -355,8 +348,7 @@ private:
         }
         const Cut cut = best(grid, count).first;
         const auto [a, b] = halves(grid, cut);
-        const std::size_t i = static_cast<std::size_t>(cut.axis);
-        const double part = (cut.at - grid.lo[i]) / (grid.hi[i] - grid.lo[i]);
+        const double part = (cut.at - grid.lo[cut.axis]) / (grid.hi[cut.axis] - grid.lo[cut.axis]);
         const double lo = static_cast<double>(component(box.lo, cut.axis)),
                      hi = static_cast<double>(component(box.hi, cut.axis));
         Box lower = box, upper = box;

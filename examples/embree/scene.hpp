@@ -389,8 +389,8 @@ inline std::vector<Box> cutScene(const Scene& scene, int count)
         detail::bisect(scene.bounds, count, cells);
         return cells;
     }
-    auto plane = [&](int axis, int i) {
-        const int n = grid[static_cast<std::size_t>(axis)];
+    auto plane = [&](std::size_t axis, int i) {
+        const int n = grid[axis];
         const float lo = component(scene.bounds.lo, axis), hi = component(scene.bounds.hi, axis);
         return i == n ? hi : lo + (hi - lo) * (static_cast<float>(i) / static_cast<float>(n));
     };

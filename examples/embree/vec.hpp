@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstddef>
 #include <cstdint>
 #include <limits>
 
@@ -15,13 +16,13 @@ using dfb::toFloat;
 using dfb::Vec3;
 using dfb::Vec3d;
 
-inline float& component(Vec3& v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
-inline float component(const Vec3& v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+inline float& component(Vec3& v, std::size_t axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+inline float component(const Vec3& v, std::size_t axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
 inline float length(const Vec3& a) { return std::sqrt(dot(a, a)); }
 
 inline double length(const Vec3d& a) { return std::sqrt(dot(a, a)); }
 
-inline double& component(Vec3d& v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+inline double& component(Vec3d& v, std::size_t axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
 
 // The zero vector stays the zero vector.
 inline Vec3d unit(const Vec3d& a)
@@ -34,7 +35,7 @@ inline Vec3 unit(const Vec3& a)
     const float l = length(a);
     return l > 0 ? a * (1 / l) : a;
 }
-inline bool isZero(const Vec3& a) { return a.x == 0 && a.y == 0 && a.z == 0; }
+inline bool isZero(const Vec3& a) { return a == Vec3(); }
 // Finite, and small enough for squares and sums of such.
 inline bool isUsable(const Vec3& a)
 {
@@ -104,11 +105,7 @@ struct Box {
     }
 };
 
-inline bool operator==(const Box& a, const Box& b)
-{
-    return a.lo.x == b.lo.x && a.lo.y == b.lo.y && a.lo.z == b.lo.z && a.hi.x == b.hi.x && a.hi.y == b.hi.y
-           && a.hi.z == b.hi.z;
-}
+inline bool operator==(const Box& a, const Box& b) { return a.lo == b.lo && a.hi == b.hi; }
 
 inline Box intersection(const Box& a, const Box& b)
 {

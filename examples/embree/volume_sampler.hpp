@@ -79,15 +79,14 @@ public:
     float valueAt(const Vec3& v) const
     {
         const auto has = [this](float at, std::size_t axis) {
-            return at >= static_cast<float>(std::max(volume_.block.lo()[axis], 0)) && at <= last(static_cast<int>(axis))
+            return at >= static_cast<float>(std::max(volume_.block.lo()[axis], 0)) && at <= last(axis)
                    && at < static_cast<float>(volume_.block.hi()[axis] - 1);
         };
         if (!has(v.x, 0) || !has(v.y, 1) || !has(v.z, 2))
             return std::numeric_limits<float>::quiet_NaN();
         return dispatch([&](const auto* voxels) {
             const auto at = cornerOf(voxels, v);
-            return lerp(at.plane(at.p, at.dx, at.dy, at.fx, at.fy), at.plane(at.p + at.dz, at.dx, at.dy, at.fx, at.fy),
-                        at.fz);
+            return lerp(at.before(), at.behind(), at.fz);
         });
     }
     // The direction in the world in which the values rise; of length 1 or 0. For a point in the cell.
@@ -95,8 +94,7 @@ public:
     {
         return dispatch([&](const auto* voxels) {
             const auto at = cornerOf(voxels, v);
-            return inWorld(unit(gradientOf(at, at.plane(at.p, at.dx, at.dy, at.fx, at.fy),
-                                           at.plane(at.p + at.dz, at.dx, at.dy, at.fx, at.fy))));
+            return inWorld(unit(gradientOf(at, at.before(), at.behind())));
         });
     }
 
@@ -147,13 +145,13 @@ private:
         return volume_.rotation.isNone() ? direction : toFloat(volume_.rotation.direction(toDouble(direction)));
     }
 
-    float last(int axis) const { return static_cast<float>(info().dims[static_cast<std::size_t>(axis)] - 1); }
+    float last(std::size_t axis) const { return static_cast<float>(info().dims[axis] - 1); }
     // Converts a step to units of 1/256 of the volume's largest extent.
     float stepIn256ths(float step) const
     {
-        int largest = 0;
-        const auto side = [this](int axis) { return std::fabs(component(volume_.placement.scale, axis)); };
-        for (const int axis : {1, 2})
+        std::size_t largest = 0;
+        const auto side = [this](std::size_t axis) { return std::fabs(component(volume_.placement.scale, axis)); };
+        for (const std::size_t axis : {1, 2})
             largest = last(axis) * side(axis) > last(largest) * side(largest) ? axis : largest;
         return 256 * step / side(largest) / last(largest);
     }
@@ -173,6 +171,9 @@ private:
             const auto at = [](T value) { return static_cast<float>(value); };
             return lerp(lerp(at(q[0]), at(q[a]), fa), lerp(at(q[b]), at(q[a + b]), fa), fb);
         }
+        // In the planes of voxels before and behind the point along z.
+        float before() const { return plane(p, dx, dy, fx, fy); }
+        float behind() const { return plane(p + dz, dx, dy, fx, fy); }
     };
     template <class T>
     Corner<T> cornerOf(const T* voxels, const Vec3& v) const
@@ -187,7 +188,7 @@ private:
                 v.z - static_cast<float>(z)};
     }
 
-    // Central differences at distance one voxel. `z0` and `z1`: the values in the planes before and behind.
+    // Central differences at distance one voxel. `z0` and `z1`: at.before() and at.behind().
     template <class T>
     Vec3 gradientOf(const Corner<T>& at, float z0, float z1) const
     {
@@ -208,8 +209,7 @@ private:
     TransferFunction::Entry shade(const T* voxels, const Vec3& v, const Vec3& view, const Light& light) const
     {
         const Corner<T> at = cornerOf(voxels, v);
-        const float z0 = at.plane(at.p, at.dx, at.dy, at.fx, at.fy),
-                    z1 = at.plane(at.p + at.dz, at.dx, at.dy, at.fx, at.fy);
+        const float z0 = at.before(), z1 = at.behind();
         TransferFunction::Entry entry = transferFunction_((lerp(z0, z1, at.fz) - look().lo) * valueScale_);
         if (!(entry.alpha > 0))
             return {};
