@@ -39,10 +39,7 @@ public:
 
     std::int64_t position() const { return position_; } // the byte behind the last line
 
-    [[noreturn]] void fail(const std::string& why) const
-    {
-        throw std::runtime_error(path_ + ": line " + std::to_string(number_) + ": " + why);
-    }
+    [[noreturn]] void fail(const std::string& why) const { throw std::runtime_error(where() + ": " + why); }
     std::string where() const { return path_ + ": line " + std::to_string(number_); }
 
     // ---- values of the line that was read last
@@ -100,6 +97,14 @@ public:
             fail("expected " + what + " 3, got " + std::to_string(dimension));
         return true;
     }
+    // A number of bytes or lines to skip.
+    std::int64_t skip(std::string_view text, const std::string& what, int least) const
+    {
+        const std::int64_t value = numbers<std::int64_t, 1>(text, what)[0];
+        if (value < least || value > std::int64_t{1} << 50)
+            fail("expected a " + what + " of " + std::to_string(least) + " or more, got " + std::string(text));
+        return value;
+    }
     std::string turnedNote() const
     {
         return where()
@@ -116,10 +121,10 @@ public:
         return (folder == std::string::npos ? "" : path_.substr(0, folder + 1)) + name;
     }
     // Throws std::runtime_error if a line that a header needs is not there.
-    static void need(const std::string& path, bool isThere, const char* name)
+    void need(bool isThere, const char* name) const
     {
         if (!isThere)
-            throw std::runtime_error(path + ": the header has no line '" + name + "'");
+            throw std::runtime_error(path_ + ": the header has no line '" + name + "'");
     }
 
 private:

@@ -11,11 +11,10 @@ namespace detail {
 
 class MetaImageReader {
 public:
-    MetaImageReader(std::istream& stream, const std::string& path) : lines_(stream, path), path_(path) {}
+    MetaImageReader(std::istream& stream, const std::string& path) : lines_(stream, path) { file_.path = path; }
 
     VolumeFile read()
     {
-        file_.path = path_;
         std::string line;
         while (file_.data.empty() && lines_.next(line)) {
             if (trimmed(line).empty())
@@ -57,7 +56,7 @@ private:
         else if (key == "ElementNumberOfChannels" && lines_.numbers<int, 1>(value, key)[0] != 1)
             lines_.fail("expected one channel, got " + value);
         else if (key == "HeaderSize")
-            readHeaderSize(value);
+            skip_ = lines_.skip(value, "HeaderSize", -1);
         else if (key == "ElementDataFile")
             readDataFile(value);
     }
@@ -100,29 +99,21 @@ private:
         if (!(m[0] > 0.999 && m[4] > 0.999 && m[8] > 0.999))
             file_.notes.push_back(lines_.turnedNote());
     }
-    void readHeaderSize(const std::string& value)
-    {
-        skip_ = lines_.numbers<std::int64_t, 1>(value, "HeaderSize")[0];
-        if (skip_ < -1 || skip_ > std::int64_t{1} << 50)
-            lines_.fail("expected a HeaderSize of -1 or more, got " + value);
-    }
     void readDataFile(const std::string& value)
     {
         isLocal_ = value == "LOCAL";
-        file_.data = isLocal_ ? path_ : lines_.pathOfData(value, "ElementDataFile");
+        file_.data = isLocal_ ? file_.path : lines_.pathOfData(value, "ElementDataFile");
     }
 
     void finish()
     {
-        const auto need = [this](bool isThere, const char* key) { HeaderLines::need(path_, isThere, key); };
-        need(file_.dims[0] > 0, "DimSize");
-        need(hasType_, "ElementType");
-        need(!file_.data.empty(), "ElementDataFile");
+        lines_.need(file_.dims[0] > 0, "DimSize");
+        lines_.need(hasType_, "ElementType");
+        lines_.need(!file_.data.empty(), "ElementDataFile");
         file_.begin = skip_ != 0 ? skip_ : isLocal_ ? lines_.position() : 0;
     }
 
     HeaderLines lines_;
-    std::string path_;
     VolumeFile file_;
     bool hasDimension_ = false, hasType_ = false, hasSpacing_ = false, isLocal_ = false;
     std::int64_t skip_ = 0;

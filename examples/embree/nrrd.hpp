@@ -14,14 +14,13 @@ namespace detail {
 
 class NrrdReader {
 public:
-    NrrdReader(std::istream& stream, const std::string& path) : lines_(stream, path), path_(path) {}
+    NrrdReader(std::istream& stream, const std::string& path) : lines_(stream, path) { file_.path = path; }
 
     VolumeFile read()
     {
-        file_.path = path_;
         std::string line;
         if (!lines_.next(line) || line.compare(0, 7, "NRRD000") != 0 || line.size() != 8)
-            throw std::runtime_error(path_ + ": expected 'NRRD000' and a digit at its start");
+            throw std::runtime_error(file_.path + ": expected 'NRRD000' and a digit at its start");
         bool endsWithFile = false;
         for (;;) {
             endsWithFile = !lines_.next(line);
@@ -30,7 +29,7 @@ public:
             const std::size_t colon = line.find(": ");
             if (line[0] == '#' || line.find(":=") < colon)
                 continue; // a comment, or a key and value, which do not describe the voxels
-            if (colon == std::string::npos && (line.empty() || line.back() != ':'))
+            if (colon == std::string::npos && line.back() != ':')
                 lines_.fail("expected 'field: value', got '" + lines_.shortened(line) + "'");
             readField(lowerCase(line.substr(0, std::min(colon, line.size() - 1))),
                       trimmed(std::string_view(line).substr(std::min(colon, line.size() - 1) + 1)));
@@ -63,13 +62,9 @@ private:
         else if (field == "data file" || field == "datafile")
             file_.data = lines_.pathOfData(value, "data file");
         else if (field == "byte skip" || field == "byteskip")
-            byteSkip_ = lines_.numbers<std::int64_t, 1>(value, "byte skip")[0];
+            byteSkip_ = lines_.skip(value, "byte skip", -1);
         else if (field == "line skip" || field == "lineskip")
-            lineSkip_ = lines_.numbers<std::int64_t, 1>(value, "line skip")[0];
-        if ((field == "byte skip" || field == "byteskip") && (byteSkip_ < -1 || byteSkip_ > mostSkipped))
-            lines_.fail("expected a byte skip of -1 or more, got " + value);
-        if ((field == "line skip" || field == "lineskip") && (lineSkip_ < 0 || lineSkip_ > mostSkipped))
-            lines_.fail("expected a line skip of 0 or more, got " + value);
+            lineSkip_ = lines_.skip(value, "line skip", 0);
     }
 
     void readType(const std::string& value)
@@ -154,17 +149,16 @@ private:
 
     void finish(bool endsWithFile)
     {
-        const auto need = [this](bool isThere, const char* field) { HeaderLines::need(path_, isThere, field); };
-        need(type_.has_value(), "type");
-        need(file_.dims[0] > 0, "sizes");
-        need(isRaw_, "encoding");
+        lines_.need(type_.has_value(), "type");
+        lines_.need(file_.dims[0] > 0, "sizes");
+        lines_.need(isRaw_, "encoding");
         file_.format.type = *type_;
-        need(isBigEndian_.has_value() || file_.format.bytes() == 1, "endian");
+        lines_.need(isBigEndian_.has_value() || file_.format.bytes() == 1, "endian");
         file_.format.isBigEndian = isBigEndian_.value_or(false);
         if (file_.data.empty()) {
             if (endsWithFile)
-                throw std::runtime_error(path_ + ": expected a line 'data file', or an empty line and the voxels");
-            file_.data = path_;
+                throw std::runtime_error(file_.path + ": expected a line 'data file', or an empty line and the voxels");
+            file_.data = file_.path;
             file_.begin = lines_.position();
         }
         skipLines();
@@ -181,17 +175,16 @@ private:
         for (std::int64_t left = lineSkip_; left > 0;) {
             const int c = file_.begin < end ? data.get() : -1;
             if (c < 0)
-                throw std::runtime_error(path_ + ": " + file_.data + ": expected " + std::to_string(lineSkip_)
+                throw std::runtime_error(file_.path + ": " + file_.data + ": expected " + std::to_string(lineSkip_)
                                          + " lines before the voxels, got " + std::to_string(lineSkip_ - left));
             ++file_.begin;
             left -= c == '\n';
         }
     }
 
-    static constexpr std::int64_t mostSkipped = std::int64_t{1} << 50, mostInLines = 1 << 24;
+    static constexpr std::int64_t mostInLines = 1 << 24;
 
     HeaderLines lines_;
-    std::string path_;
     VolumeFile file_;
     std::optional<FileType> type_;
     std::optional<bool> isBigEndian_;
