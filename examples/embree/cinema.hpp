@@ -6,7 +6,6 @@
 
 #include <cmath>
 #include <cstdio>
-#include <fstream>
 #include <string>
 #include <vector>
 
@@ -17,20 +16,16 @@ namespace example {
 // file's name.
 inline void writeCinema(const std::string& path, const View& view, const std::vector<std::string>& files)
 {
-    errno = 0;
-    std::ofstream stream(path, std::ios::trunc);
-    stream << "phi,theta,FILE\n";
+    std::string table = "phi,theta,FILE\n";
     for (std::size_t frame = 0; frame < files.size(); ++frame) {
         const double turn = 360.0 * static_cast<double>(frame) / static_cast<double>(files.size());
         const double azimuth = std::fmod(static_cast<double>(view.azimuth) + turn, 360.0);
         char angles[80];
         std::snprintf(angles, sizeof angles, "%.10g,%.10g,", azimuth < 0 ? azimuth + 360 : azimuth,
                       static_cast<double>(view.elevation));
-        stream << angles << files[frame] << '\n';
+        table += angles + files[frame] + '\n';
     }
-    stream.close();
-    if (!stream)
-        detail::failToWrite(path, std::strerror(errno));
+    writeText(path, table);
 }
 
 } // namespace example
