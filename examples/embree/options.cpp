@@ -357,10 +357,8 @@ private:
         refuse(!isData, "--deep", "needs --mode data");
         refuse(options_.bricks > mostCells / options_.interleave, "--interleave",
                "makes more than 16777216 cells of so many --bricks");
-        refuse(options_.interleave > 1 || options_.deep > 0, "--adaptive", "does not go with --interleave or --deep");
-        refuse(options_.interleave > 1 || options_.deep > 0, "--aux", "does not go with --interleave or --deep");
-        refuse(options_.interleave > 1 || options_.deep > 0, "--wall", "does not go with --interleave or --deep");
-        refuse(options_.interleave > 1 || options_.deep > 0, "--exposure", "does not go with --interleave or --deep");
+        for (const char* other : {"--adaptive", "--aux", "--wall", "--exposure"})
+            refuse(options_.isDeep(), other, "does not go with --interleave or --deep");
         refuse(options_.adaptive > 0, "--wall", "does not go with --adaptive");
         refuse(options_.adaptive > 0, "--exposure", "does not go with --adaptive");
         refuse(options_.adaptive > 0 && options_.passes < 8, "--adaptive",
@@ -379,10 +377,9 @@ private:
     {
         if (options_.isExr() && options_.wallColumns > 0)
             throw CLI::ValidationError("--output", "an .exr is not written for a wall");
-        if (options_.isExr() && app_.count("--layers") == 0 && (options_.interleave > 1 || options_.deep > 0))
+        if (options_.isExr() && app_.count("--layers") == 0 && options_.isDeep())
             options_.layers &= dfb::depthChannel;
-        if (options_.isExr() && (options_.layers & dfb::imageAuxChannels)
-            && (options_.interleave > 1 || options_.deep > 0))
+        if (options_.isExr() && (options_.layers & dfb::imageAuxChannels) && options_.isDeep())
             throw CLI::ValidationError("--layers", "other than depth do not go with --interleave or --deep");
         refuse(options_.pngBits == 16, "--dither", "does not go with --png-bits 16");
         refuse(options_.wallColumns > 0, "--png-bits", "does not go with --wall");

@@ -85,6 +85,8 @@ struct Options : OutputFiles, RenderSettings {
     // left out.
     std::vector<std::pair<std::string, std::string>> values;
     std::vector<std::pair<std::string, std::string>> given; // those of them that the user gave
+
+    bool isDeep() const { return deep > 0 || interleave > 1; }
 };
 
 // Exit codes besides 0.

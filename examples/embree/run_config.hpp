@@ -29,7 +29,7 @@ enum class Compositing {
 
 inline Compositing compositingOf(const Options& o)
 {
-    if (o.deep > 0 || o.interleave > 1)
+    if (o.isDeep())
         return Compositing::Deep;
     if (o.mode == Mode::Image && (o.verify || o.blend == Blending::Sort))
         return o.verify         ? Compositing::SingleVerified
@@ -62,13 +62,11 @@ inline bool wantsFloat(const Options& o)
 
 inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
 {
-    dfb::FrameBufferConfig config;
-    config.image.width = o.width;
-    config.image.height = o.height;
-    config.image.format = wantsFloat(o) ? dfb::OutputFormat::RGBA32F
-                          : !o.output.empty() || !o.depth.empty() || !o.aux.empty() || o.verify || o.live
-                              ? dfb::OutputFormat::SRGBA8
-                              : dfb::OutputFormat::None;
+    const auto format = wantsFloat(o) ? dfb::OutputFormat::RGBA32F
+                        : !o.output.empty() || !o.depth.empty() || !o.aux.empty() || o.verify || o.live
+                            ? dfb::OutputFormat::SRGBA8
+                            : dfb::OutputFormat::None;
+    dfb::FrameBufferConfig config(o.width, o.height, format);
     config.image.dither = o.dither;
     const dfb::ChannelMask layers = o.isExr() ? o.layers : dfb::ChannelMask{0};
     config.image.depth = !o.depth.empty() || (layers & dfb::depthChannel) != 0;
