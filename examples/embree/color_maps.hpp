@@ -97,12 +97,6 @@ inline std::vector<std::string> transferNames()
 
 namespace detail {
 
-inline Vec3 colorOf(std::uint32_t rgb)
-{
-    const auto channel = [rgb](int shift) { return static_cast<float>(rgb >> shift & 255) / 255; };
-    return {channel(16), channel(8), channel(0)};
-}
-
 // A linear colour in sRGB.
 inline Vec3 displayOf(const Vec3& linear)
 {

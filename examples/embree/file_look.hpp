@@ -96,17 +96,13 @@ inline std::string checkEnding(const std::string& path, const std::vector<std::s
 // The linear RGB of an sRGB colour, given as three numbers from 0 to 1 or as #rrggbb; none if it is no colour.
 inline std::optional<Vec3> displayColor(const std::string& text)
 {
-    if (text.size() == 7 && text[0] == '#'
-        && text.find_first_not_of("0123456789abcdefABCDEF", 1) == std::string::npos) {
-        const unsigned long rgb = std::strtoul(text.c_str() + 1, nullptr, 16);
-        const auto channel = [rgb](int shift) { return static_cast<float>(rgb >> shift & 255) / 255; };
-        return detail::linearOf({channel(16), channel(8), channel(0)});
-    }
+    if (text.size() == 7 && text[0] == '#' && text.find_first_not_of("0123456789abcdefABCDEF", 1) == std::string::npos)
+        return detail::linearOf(
+            detail::colorOf(static_cast<std::uint32_t>(std::strtoul(text.c_str() + 1, nullptr, 16))));
     const std::vector<float> c = detail::numbersOf(text, 3);
-    for (const float channel : c)
-        if (!(channel >= 0 && channel <= 1))
-            return std::nullopt;
-    return c.empty() ? std::nullopt : std::optional<Vec3>(detail::linearOf({c[0], c[1], c[2]}));
+    if (c.empty() || !detail::isColor({c[0], c[1], c[2]}))
+        return std::nullopt;
+    return detail::linearOf({c[0], c[1], c[2]});
 }
 
 // Sets what `key` names. Returns false if there is no such key. Throws std::invalid_argument, whose text does not name

@@ -65,6 +65,13 @@ void addVertex(Mesh& mesh, const Vec3& p, const Where& where)
     mesh.positions.push_back(p);
 }
 
+// The channels of 0xRRGGBB, each in [0, 1].
+inline Vec3 colorOf(std::uint32_t rgb)
+{
+    const auto channel = [rgb](int shift) { return static_cast<float>(rgb >> shift & 255) / 255; };
+    return {channel(16), channel(8), channel(0)};
+}
+
 // Converts a colour from sRGB, each channel in [0, 1].
 inline Vec3 linearOf(const Vec3& srgb)
 {
