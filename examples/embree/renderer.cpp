@@ -434,9 +434,7 @@ void Renderer::findCrossings(const Vec3& origin, const Vec3& direction, int k, s
             crossings.push_back(hit);
         }
     }
-    std::sort(crossings.begin(), crossings.end(), [](const Hit& a, const Hit& b) {
-        return a.t != b.t ? a.t < b.t : a.geometry != b.geometry ? a.geometry < b.geometry : a.primitive < b.primitive;
-    });
+    std::sort(crossings.begin(), crossings.end());
 }
 
 } // namespace example

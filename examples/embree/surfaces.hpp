@@ -17,6 +17,7 @@
 #include <mutex>
 #include <optional>
 #include <stdexcept>
+#include <tuple>
 #include <type_traits>
 
 namespace example {
@@ -27,6 +28,12 @@ struct Hit {
     Vec3 normal;                               // unit; which side it points to is open
     Vec3 color;
     std::optional<float> opacity; // none: that of the run
+
+    // Front to back; at one point by their numbers.
+    friend bool operator<(const Hit& a, const Hit& b)
+    {
+        return std::tie(a.t, a.geometry, a.primitive) < std::tie(b.t, b.geometry, b.primitive);
+    }
 };
 
 // One device for all bricks of the process, for as long as there are any: Embree cannot make thousands.
@@ -184,7 +191,7 @@ private:
                 return;
             // Embree goes roughly front to back, so the place is near the end.
             auto at = hits->end();
-            while (at != hits->begin() && isBefore(hit, at[-1]))
+            while (at != hits->begin() && hit < at[-1])
                 --at;
             // A point on an edge belongs to two triangles but is seen once, as a point of the first.
             if (at != hits->begin() && isSamePoint(hit, at[-1]))
@@ -206,12 +213,6 @@ private:
         }
 
         static bool isSamePoint(const Hit& a, const Hit& b) { return a.t == b.t && a.geometry == b.geometry; }
-        static bool isBefore(const Hit& a, const Hit& b)
-        {
-            return a.t != b.t                 ? a.t < b.t
-                   : a.geometry != b.geometry ? a.geometry < b.geometry
-                                              : a.primitive < b.primitive;
-        }
     };
 
     struct Release {
