@@ -20,7 +20,7 @@ class Histogram {
 public:
     // The bins begin at `lo`. Values beyond them are counted in the outermost bins.
     Histogram(float lo, float width, std::size_t bins) : lo_(lo), width_(width), counts_(bins) {}
-    explicit Histogram(float lo, float width, std::vector<std::uint64_t> counts)
+    Histogram(float lo, float width, std::vector<std::uint64_t> counts)
         : lo_(lo), width_(width), counts_(std::move(counts))
     {
     }
@@ -31,7 +31,6 @@ public:
         ++counts_[at > 0 ? std::min(static_cast<std::size_t>(std::min(at, 1e9f)), counts_.size() - 1) : 0];
     }
     const std::vector<std::uint64_t>& counts() const { return counts_; }
-    float lo() const { return lo_; }
     float width() const { return width_; }
     float lowerEdge(std::size_t bin) const { return lo_ + width_ * static_cast<float>(bin); }
 
@@ -157,8 +156,7 @@ inline Histogram countedOver(const VolumeSource& source, const LatticeRows& latt
 // Collective. If the values of nearly all voxels are close together, the histogram covers only these.
 inline Histogram histogramOf(const VolumeSource& source, const LatticeRows& lattice, const Loaders& loaders)
 {
-    const float greatest = source.info.maximum;
-    Histogram histogram = countedOver(source, lattice, source.info.least, greatest, loaders);
+    Histogram histogram = countedOver(source, lattice, source.info.least, source.info.maximum, loaders);
     for (int again = 0; again < 2; ++again) {
         const std::size_t first = histogram.quantileBin(0.0001), last = histogram.quantileBin(0.9999),
                           bins = histogram.counts().size();

@@ -169,7 +169,7 @@ private:
         const Vec3 target{static_cast<float>(t[0]), static_cast<float>(t[1]), static_cast<float>(t[2])};
         const Vec3 center = scene_->info.focus.box.center();
         view.target.reset();
-        if (target.x != center.x || target.y != center.y || target.z != center.z)
+        if (!(target == center))
             view.target = target;
         isDrawn_ = false;
         samples_ = 0;

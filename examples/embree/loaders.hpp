@@ -64,17 +64,13 @@ public:
         if (size_ == 1)
             return step();
         Bytes own(1); // a first byte of 1: an error's text follows
-        const auto add = [&own](const void* data, std::size_t size) {
-            const auto* first = static_cast<const std::byte*>(data);
-            own.insert(own.end(), first, first + size);
-        };
         try {
             const std::vector<T> values = step();
-            add(values.data(), values.size() * sizeof(T));
+            append(own, values.data(), values.size() * sizeof(T));
         } catch (const std::exception& e) {
             const std::string text = reasonOf(e);
             own.assign(1, std::byte{1});
-            add(text.data(), text.size());
+            append(own, text.data(), text.size());
         }
         const std::vector<Bytes> ofRanks = gather_(own);
         for (const Bytes& bytes : ofRanks)
@@ -203,12 +199,8 @@ public:
     {
         static_assert(std::is_trivially_copyable_v<T>);
         const std::uint64_t count = array.size();
-        const auto add = [&bytes](const void* data, std::size_t size) {
-            const auto* first = static_cast<const std::byte*>(data);
-            bytes.insert(bytes.end(), first, first + size);
-        };
-        add(&count, sizeof count);
-        add(array.data(), array.size() * sizeof(T));
+        append(bytes, &count, sizeof count);
+        append(bytes, array.data(), array.size() * sizeof(T));
     }
     template <class T>
     static void unpack(const std::byte*& at, std::vector<T>& array)
@@ -224,6 +216,12 @@ public:
     }
 
 private:
+    static void append(Bytes& bytes, const void* data, std::size_t size)
+    {
+        const auto* first = static_cast<const std::byte*>(data);
+        bytes.insert(bytes.end(), first, first + size);
+    }
+
     int rank_ = 0, size_ = 1;
     Gather gather_;
     Sum sum_;
