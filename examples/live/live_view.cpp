@@ -193,18 +193,13 @@ public:
         home_ = home.camera;
     }
 
-    LiveWishes wishes() const override
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return current();
-    }
-
     LiveWishes waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const override
     {
         const auto until = std::chrono::steady_clock::now() + std::min<std::chrono::milliseconds>(atMost, longest);
         std::unique_lock<std::mutex> lock(mutex_);
         for (;;) {
-            const LiveWishes now = current();
+            LiveWishes now = wishes_;
+            now.ends = ends_ || Interrupt::happened();
             if (now.number != number || now.ends || std::chrono::steady_clock::now() >= until)
                 return now;
             // A signal does not wake this thread, so it looks every 100 ms.
@@ -264,14 +259,6 @@ private:
     static constexpr std::chrono::hours longest{24 * 365};
     static constexpr std::chrono::seconds mostWait{8}; // for a picture
     static constexpr std::size_t mostBody = 4096;
-
-    // Needs the lock of mutex_.
-    LiveWishes current() const
-    {
-        LiveWishes now = wishes_;
-        now.ends = ends_ || Interrupt::happened();
-        return now;
-    }
 
     // Needs the lock of watchMutex_.
     void callIfMoved()

@@ -84,8 +84,6 @@ public:
     // Viewers may have wishes from now on; `home` is what is shown until they have.
     virtual void open(const LiveScene& scene, const LiveWishes& home) = 0;
 
-    // Returns the wishes at this moment. Any thread.
-    virtual LiveWishes wishes() const = 0;
     // Waits until the wishes are others than those of this `number`, the job is to end, or `atMost` has passed. Returns
     // the wishes.
     virtual LiveWishes waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const = 0;
@@ -114,7 +112,7 @@ void tellTiles(const FrameBuffer& fb, LivePicture& picture)
 }
 
 // Returns the wishes of the display rank's viewers, on all ranks, with `ends` set if it is set on any rank. `mine` is,
-// on the display rank, what LiveView::wishes() or waitForChange() has returned; on the others only its `ends` counts.
+// on the display rank, what LiveView::waitForChange() has returned; on the others only its `ends` counts.
 // Collective, outside frames.
 template <class FrameBuffer>
 LiveWishes shareWishes(FrameBuffer& fb, const LiveWishes& mine)

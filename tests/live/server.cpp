@@ -88,10 +88,11 @@ struct Fixture {
         const auto answer = client().Post(path(name), body, "application/json");
         return answer ? answer->status : -1;
     }
+    example::LiveWishes wishes() const { return view.waitForChange(0, std::chrono::milliseconds(0)); }
     void show(int width = 320, int height = 200, int shade = 0)
     {
         example::LivePicture picture;
-        picture.wishes = view.wishes();
+        picture.wishes = wishes();
         picture.tileSize = 64;
         picture.owners.assign(static_cast<std::size_t>((width + 63) / 64 * ((height + 63) / 64)), 1);
         view.show(pixelsOf(width, height, shade).data(), width, height, {}, picture);
@@ -190,8 +191,8 @@ TEST_CASE("a live view answers nobody without the token")
             REQUIRE(answer);
             CHECK(answer->status == 403);
         }
-    CHECK(f.view.wishes().number == 0);
-    CHECK(f.view.wishes().ends == 0);
+    CHECK(f.wishes().number == 0);
+    CHECK(f.wishes().ends == 0);
     CHECK(f.get(f.path("/")) == 200);
     CHECK(f.get(f.path("/nothing")) == 404);
 }
@@ -258,7 +259,7 @@ TEST_CASE("what viewers want reaches the job, and nonsense does not")
 {
     Fixture f;
     CHECK(f.post("/camera", R"({"azimuth": 12.5, "elevation": -3, "width": 640, "height": 480})") == 200);
-    example::LiveWishes wishes = f.view.wishes();
+    example::LiveWishes wishes = f.wishes();
     CHECK(wishes.number == 1);
     CHECK(wishes.look == 1);
     CHECK(wishes.camera.azimuth == 12.5);
@@ -267,19 +268,19 @@ TEST_CASE("what viewers want reaches the job, and nonsense does not")
     CHECK(wishes.width == 640);
     CHECK(wishes.height == 480);
     CHECK(f.post("/camera", R"({"azimuth": 12.5})") == 200); // no change
-    CHECK(f.view.wishes().number == 1);
+    CHECK(f.wishes().number == 1);
     CHECK(f.post("/camera", R"({"samples": 4, "target": [1, 2, 3.5]})") == 200);
-    CHECK(f.view.wishes().samples == 4);
-    CHECK(f.view.wishes().camera.target[2] == 3.5);
+    CHECK(f.wishes().samples == 4);
+    CHECK(f.wishes().camera.target[2] == 3.5);
     CHECK(f.view.hasMoved(1, false));
     CHECK_FALSE(f.view.hasMoved(2, false));
     CHECK_FALSE(f.view.hasMoved(1, true));
     CHECK(f.post("/command", R"({"command": "step"})") == 200);
-    CHECK(f.view.wishes().isPaused == 1);
-    CHECK(f.view.wishes().steps == 1);
-    CHECK(f.view.wishes().look == 2);
+    CHECK(f.wishes().isPaused == 1);
+    CHECK(f.wishes().steps == 1);
+    CHECK(f.wishes().look == 2);
 
-    const std::uint64_t before = f.view.wishes().number;
+    const std::uint64_t before = f.wishes().number;
     for (const char* body : {"",
                              "{",
                              "[]",
@@ -309,7 +310,7 @@ TEST_CASE("what viewers want reaches the job, and nonsense does not")
         INFO(body);
         CHECK(f.post("/command", body) == 400);
     }
-    CHECK(f.view.wishes().number == before);
+    CHECK(f.wishes().number == before);
     for (const char* query : {"&after=-1", "&after=x", "&after=9999999999999999999", "&quality=9", "&quality=101"}) {
         INFO(query);
         CHECK(f.get(f.path("/frame", query)) == 400);
@@ -317,7 +318,7 @@ TEST_CASE("what viewers want reaches the job, and nonsense does not")
     Fixture still(false);
     CHECK(still.post("/command", R"({"command": "pause"})") == 400);
     CHECK(still.post("/command", R"({"command": "end"})") == 200);
-    CHECK(still.view.wishes().ends == 1);
+    CHECK(still.wishes().ends == 1);
 }
 
 TEST_CASE("a job that waits for its viewers hears them")
@@ -349,7 +350,7 @@ TEST_CASE("a job that waits for its viewers hears them")
     CHECK(told == 2);
     const auto looksAt = [&](const char* wish) {
         CHECK(f.post("/camera", wish) == 200);
-        return f.view.wishes().look;
+        return f.wishes().look;
     };
     f.view.whileWatching(
         looksAt(R"({"width": 640, "height": 480})"), true, [&] { ++told; },
@@ -361,7 +362,7 @@ TEST_CASE("a job that waits for its viewers hears them")
             CHECK(told == 3);
         });
     f.view.whileWatching(
-        f.view.wishes().look, true, [&] { ++told; },
+        f.wishes().look, true, [&] { ++told; },
         [&] {
             looksAt(R"({"azimuth": 6})");
             CHECK(told == 3);
@@ -400,7 +401,7 @@ TEST_CASE("requests and bodies have limits")
     CHECK(isCutOff("GET /", many));                           // a path without end
     CHECK(isCutOff(head, "A: 1\r\nB: 2\r\nC: 3\r\n" + many)); // headers without end
     CHECK(f.get(f.path("/stats")) == 200);
-    CHECK(f.view.wishes().number == 0);
+    CHECK(f.wishes().number == 0);
     CHECK(peakMemoryKb() - before < 64 << 10);
     f.show();
     for (const char* header : {"Range: bytes=0-", "RANGE:bytes=0-1,0-1"}) { // they would take much stack and memory
@@ -502,10 +503,10 @@ TEST_CASE("ten thousand random requests")
     }
     INFO("answered " << answered);
     CHECK(answered > 5000);
-    CHECK(f.view.wishes().ends == 0);
+    CHECK(f.wishes().ends == 0);
     CHECK(f.get(f.path("/stats")) == 200);
     CHECK(f.post("/camera", R"({"azimuth": 77})") == 200);
-    CHECK(f.view.wishes().camera.azimuth == 77);
+    CHECK(f.wishes().camera.azimuth == 77);
 }
 
 TEST_CASE("viewers that are dead or slow take nothing from the job and the other viewers")
