@@ -34,11 +34,9 @@ void print(IceTEnum level, const std::string& text)
     const IceTBitField wanted = context ? context->settings.diagnostics : IceTBitField{ICET_DIAG_WARNINGS};
     if ((wanted & level) != level)
         return;
-    if (!context)
-        std::printf("ICET:%s: %s\n", nameOf(level), text.c_str());
-    else if ((wanted & ICET_DIAG_ALL_NODES) != 0)
+    if (context && (wanted & ICET_DIAG_ALL_NODES) != 0)
         std::printf("ICET,%d:%s: %s\n", context->rank(), nameOf(level), text.c_str());
-    else if (context->rank() == 0)
+    else if (!context || context->rank() == 0)
         std::printf("ICET:%s: %s\n", nameOf(level), text.c_str());
     std::fflush(stdout);
 }
