@@ -80,14 +80,14 @@ public:
     bool isFloat() const { return isFloat_; }
     std::size_t fileBytes() const { return fileBytes_; } // of a voxel
 
-    // Reads the voxels [lo, lo + count) in memory's type, x fastest. Throws std::runtime_error.
-    void read(const Index3& lo, const Index3& count, std::byte* out) const
+    // Reads the voxels [lo, hi) in memory's type, x fastest. Throws std::runtime_error.
+    void read(const Index3& lo, const Index3& hi, std::byte* out) const
     {
         const std::lock_guard<std::mutex> lock(hdf5Mutex());
         std::vector<hsize_t> start(extent_.size(), 0), size(extent_.size(), 1);
         for (std::size_t axis = 0; axis < 3; ++axis) {
             start[axes_[axis]] = static_cast<hsize_t>(lo[axis]);
-            size[axes_[axis]] = static_cast<hsize_t>(count[axis]);
+            size[axes_[axis]] = static_cast<hsize_t>(hi[axis] - lo[axis]);
         }
         // Both have the same shape; otherwise the library copies chunked data voxel by voxel.
         const Hdf5Object in(H5Scopy(space_.id()), H5Sclose),
@@ -229,7 +229,7 @@ inline VolumeSource openHdf5(const std::string& path, const Loaders& loaders = {
         info.type = volume->type();
         isFloat = volume->isFloat();
         read = [volume, counter = loaders.readCounter()](const Index3& lo, const Index3& hi, std::byte* out) {
-            volume->read(lo, {hi[0] - lo[0], hi[1] - lo[1], hi[2] - lo[2]}, out);
+            volume->read(lo, hi, out);
             *counter += voxelsOfBox(lo, hi) * volume->fileBytes();
         };
         if (info.type == VoxelType::UInt8)
