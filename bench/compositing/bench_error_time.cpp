@@ -131,10 +131,7 @@ public:
             while (bench::now() < until) {
             }
         };
-        dfb::FrameBufferConfig c;
-        c.image.width = width;
-        c.image.height = height;
-        c.image.format = dfb::OutputFormat::RGBA32F;
+        dfb::FrameBufferConfig c(width, height, dfb::OutputFormat::RGBA32F);
         c.executor = std::make_shared<dfb::ThreadExecutor>(1);
         dfb::DistributedFrameBuffer<Op> fb(comm_, c);
         dfb::ImageParallelLoop loop(fb, dfb::WorkDistribution::Dynamic);

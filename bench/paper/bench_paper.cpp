@@ -40,9 +40,7 @@ struct Options {
 
     dfb::FrameBufferConfig config(int width, int height, const bench::Trace& traced) const
     {
-        dfb::FrameBufferConfig c;
-        c.image.width = width;
-        c.image.height = height;
+        dfb::FrameBufferConfig c(width, height);
         c.executor = std::make_shared<dfb::ThreadExecutor>(threads);
         c.trace = traced.sink;
 #if defined(DFB_HAS_SNAPPY)

@@ -217,9 +217,7 @@ public:
         // Framebuffers and memory of a case go before the next.
         const auto connection = dfb::connect<dfb::MpiTransport>(comm_);
         const auto executor = std::make_shared<dfb::ThreadExecutor>(1);
-        FrameBuffer::Config config;
-        config.image.width = config.image.height = c.side;
-        config.image.format = c.format;
+        FrameBuffer::Config config(c.side, c.side, c.format);
         config.executor = executor;
         const bench::Trace trace(trace_);
         config.trace = trace.sink;

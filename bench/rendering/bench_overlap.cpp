@@ -40,9 +40,7 @@ public:
 
     void run(int width, int height)
     {
-        dfb::FrameBufferConfig config;
-        config.image.width = width;
-        config.image.height = height;
+        dfb::FrameBufferConfig config(width, height);
         config.executor = std::make_shared<dfb::CallerExecutor>(); // one thread per rank, as IceT has
         const bench::Trace trace(o_.trace);
         config.trace = trace.sink;
@@ -85,9 +83,7 @@ public:
     // All views in a row.
     void runInARow(int width, int height)
     {
-        dfb::FrameBufferConfig config;
-        config.image.width = width;
-        config.image.height = height;
+        dfb::FrameBufferConfig config(width, height);
         config.executor = std::make_shared<dfb::CallerExecutor>();
         std::vector<std::unique_ptr<bench::MarchedBricks>> all;
         std::vector<MarchedSystem> systems;

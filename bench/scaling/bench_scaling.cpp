@@ -292,9 +292,7 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
         const bench::PartialImage& image = images[rank];
         const auto connection =
             dfb::connect<bench::CountedTransport>(bench::CountedTransport::Communicator{communicator, counters});
-        dfb::FrameBufferConfig config;
-        config.image.width = width;
-        config.image.height = height;
+        dfb::FrameBufferConfig config(width, height);
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         config.quiet = std::chrono::minutes(10); // or slow frames have messages that say that nothing is lost
         const bench::Trace trace(tracePath);

@@ -155,9 +155,7 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
     FrameCost cost;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         const int rank = communicator.rank();
-        dfb::FrameBufferConfig config;
-        config.image.width = s.width;
-        config.image.height = s.height;
+        dfb::FrameBufferConfig config(s.width, s.height);
         config.image.aux = s.aux;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         const bench::Trace trace(s.trace);
@@ -359,9 +357,7 @@ Sampling sample(int width, int height)
     std::atomic<std::int64_t> renders{0}, convergedRenders{0};
     Sampling result;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
-        dfb::FrameBufferConfig config;
-        config.image.width = width;
-        config.image.height = height;
+        dfb::FrameBufferConfig config(width, height);
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
         const dfb::World world = worldOf(fb.rank(), {0, 0, width, height});
