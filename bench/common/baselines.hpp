@@ -62,11 +62,6 @@ public:
         changed_.wait(lock, [this] { return set_; });
         set_ = false;
     }
-    bool isSet()
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return set_;
-    }
 
 private:
     std::mutex mutex_;
@@ -75,6 +70,19 @@ private:
 };
 
 // ---- plain MPI
+
+inline int rankIn(MPI_Comm comm)
+{
+    int rank = 0;
+    MPI_Comm_rank(comm, &rank);
+    return rank;
+}
+inline int sizeOf(MPI_Comm comm)
+{
+    int size = 1;
+    MPI_Comm_size(comm, &size);
+    return size;
+}
 
 // How a thread waits for MPI: inside MPI; testing, and giving up its time slice in between; or testing for 5 us and
 // then every 50 us.
@@ -210,11 +218,8 @@ inline double reduce(MPI_Comm comm, double value, MPI_Op operation)
 // On rank 0: the samples of all ranks, one after the other.
 inline std::vector<double> collect(MPI_Comm comm, const std::vector<double>& samples)
 {
-    int rank = 0, size = 1;
-    MPI_Comm_rank(comm, &rank);
-    MPI_Comm_size(comm, &size);
     const auto count = static_cast<int>(samples.size());
-    std::vector<int> counts(static_cast<std::size_t>(size)), places(static_cast<std::size_t>(size));
+    std::vector<int> counts(static_cast<std::size_t>(sizeOf(comm))), places(counts.size());
     MPI_Request request = MPI_REQUEST_NULL;
     MPI_Igather(&count, 1, MPI_INT, counts.data(), 1, MPI_INT, 0, comm, &request);
     napThrough(request);
@@ -223,7 +228,7 @@ inline std::vector<double> collect(MPI_Comm comm, const std::vector<double>& sam
         places[r] = total;
         total += counts[r];
     }
-    std::vector<double> all(rank == 0 ? static_cast<std::size_t>(total) : 0);
+    std::vector<double> all(rankIn(comm) == 0 ? static_cast<std::size_t>(total) : 0);
     MPI_Igatherv(samples.data(), count, MPI_DOUBLE, all.data(), counts.data(), places.data(), MPI_DOUBLE, 0, comm,
                  &request);
     napThrough(request);
@@ -271,15 +276,14 @@ void withMpi(int argc, char** argv, const Body& body)
 
 inline std::string environment(MPI_Comm comm)
 {
-    int size = 1, length = 0;
-    MPI_Comm_size(comm, &size);
+    int length = 0;
     char library[MPI_MAX_LIBRARY_VERSION_STRING];
     MPI_Get_library_version(library, &length);
     std::string version(library, static_cast<std::size_t>(length));
     version = version.substr(0, version.find('\n'));
     for (char& c : version)
         c = c == '\t' ? ' ' : c;
-    return std::to_string(size) + " ranks, " + std::to_string(std::thread::hardware_concurrency()) + " cores, "
+    return std::to_string(sizeOf(comm)) + " ranks, " + std::to_string(std::thread::hardware_concurrency()) + " cores, "
            + version;
 }
 

@@ -206,10 +206,9 @@ std::string ratios(const Result* a, const Result* b)
 
 class Bench {
 public:
-    Bench(MPI_Comm comm, Options o) : comm_(comm), o_(std::move(o))
+    Bench(MPI_Comm comm, Options o)
+        : comm_(comm), o_(std::move(o)), rank_(bench::rankIn(comm)), size_(bench::sizeOf(comm))
     {
-        MPI_Comm_rank(comm, &rank_);
-        MPI_Comm_size(comm, &size_);
 #ifndef DFB_BENCH_HAS_ICET
         if (rank_ == 0 && o_.wants("icet"))
             std::printf("IceT is not measured: this was built without it (bench/get_icet.sh gets it)\n");
@@ -363,7 +362,7 @@ private:
 
     MPI_Comm comm_;
     Options o_;
-    int rank_ = 0, size_ = 1;
+    int rank_, size_;
 };
 
 // Ends the program after --help, or if it was called wrongly.

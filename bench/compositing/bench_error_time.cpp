@@ -70,10 +70,9 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 
 class Bench {
 public:
-    Bench(MPI_Comm comm, Options o) : comm_(comm), o_(std::move(o))
+    Bench(MPI_Comm comm, Options o)
+        : comm_(comm), o_(std::move(o)), rank_(bench::rankIn(comm)), size_(bench::sizeOf(comm))
     {
-        MPI_Comm_rank(comm, &rank_);
-        MPI_Comm_size(comm, &size_);
     }
 
     void bricks()
@@ -326,7 +325,7 @@ private:
 
     MPI_Comm comm_;
     Options o_;
-    int rank_ = 0, size_ = 1;
+    int rank_, size_;
     std::vector<Row> floats_, bytes_, noise_; // on rank 0
     std::vector<Kernel> kernels_;
 };

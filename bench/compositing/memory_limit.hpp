@@ -20,8 +20,6 @@ public:
     // `viewports`: of all ranks.
     MemoryLimit(MPI_Comm comm, const std::vector<std::array<int, 4>>& viewports, bool toBytes) : comm_(comm)
     {
-        int rank = 0;
-        MPI_Comm_rank(comm, &rank);
         int x0 = 1 << 30, y0 = x0, x1 = 0, y1 = 0;
         for (const auto& [x, y, columns, rows] : viewports)
             if (columns > 0 && rows > 0) {

@@ -35,9 +35,7 @@ using dfb::Connection;
 // The viewports of all ranks. Collective.
 inline std::vector<std::array<int, 4>> viewportsOf(MPI_Comm comm, const PartialImage& image)
 {
-    int size = 1;
-    MPI_Comm_size(comm, &size);
-    std::vector<std::array<int, 4>> all(static_cast<std::size_t>(size));
+    std::vector<std::array<int, 4>> all(static_cast<std::size_t>(sizeOf(comm)));
     MPI_Request request = MPI_REQUEST_NULL;
     MPI_Iallgather(image.viewport.data(), 4, MPI_INT, all.data(), 4, MPI_INT, comm, &request);
     napThrough(request);
@@ -514,9 +512,7 @@ inline std::uint64_t readAll(const void* image, std::size_t byteCount)
 // has read it. `timer`: of `comm`.
 inline void timeFrame(MPI_Comm comm, FrameTimer& timer, System& s, bool counts, std::size_t imagePixels = 0)
 {
-    int rank = 0;
-    MPI_Comm_rank(comm, &rank);
-    const std::size_t readPixels = rank == 0 ? imagePixels : 0;
+    const std::size_t readPixels = rankIn(comm) == 0 ? imagePixels : 0;
     timer.synchronize();
     meet(comm);
     const double start = timer.clock(), cpuBefore = processCpuSeconds(), yieldedBefore = yieldedSeconds();
@@ -540,9 +536,7 @@ inline void timeFrame(MPI_Comm comm, FrameTimer& timer, System& s, bool counts, 
 inline void takeResult(MPI_Comm comm, System& s, const ExactImage& exact)
 {
     Result& r = s.result;
-    int rank = 0;
-    MPI_Comm_rank(comm, &rank);
-    MPI_Comm_size(comm, &r.ranks);
+    r.ranks = sizeOf(comm);
     r.system = s.name;
     r.config = s.config + ", to " + s.output;
     r.ms = figureOf(s.ms);
@@ -555,7 +549,7 @@ inline void takeResult(MPI_Comm comm, System& s, const ExactImage& exact)
         r.bytes = reduce(comm, r.bytes, MPI_SUM);
         r.messages = reduce(comm, r.messages, MPI_SUM);
     }
-    if (rank == 0 && (s.compositor.floats || s.compositor.bytes)) {
+    if (rankIn(comm) == 0 && (s.compositor.floats || s.compositor.bytes)) {
         const dfb::testing::ErrorReport e = errorOf(s.compositor.floats ? s.compositor.floats() : nullptr,
                                                     s.compositor.bytes ? s.compositor.bytes() : nullptr, exact);
         r.maxError = e.maxAbs;

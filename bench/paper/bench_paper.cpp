@@ -346,8 +346,7 @@ int main(int argc, char** argv)
     Options options = optionsOf(argc, argv);
     bool isRight = true;
     bench::withMpi(argc, argv, [&](MPI_Comm comm) {
-        int size = 1;
-        MPI_Comm_size(comm, &size);
+        const int size = bench::sizeOf(comm);
         std::vector<int>& ranks = options.ranks;
         if (ranks.empty()) {
             for (int n = 1; n < size && options.figure != 10; n *= 2)

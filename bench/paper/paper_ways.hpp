@@ -30,9 +30,8 @@ public:
     PaperStage(MPI_Comm comm, PaperScene scene, dfb::FrameBufferConfig config, int views)
         : scene_(std::move(scene)), connection_(dfb::connect<dfb::MpiTransport>(comm)), config_(std::move(config)),
           cameras_(orbitOf(views, unit, 1.5f)), width_(config_.image.width), height_(config_.image.height),
-          grid_(sizeOf(comm)), ranks_(sizeOf(comm))
+          rank_(rankIn(comm)), grid_(sizeOf(comm)), ranks_(sizeOf(comm))
     {
-        MPI_Comm_rank(comm, &rank_);
     }
 
     // Every rank has the whole scene.
@@ -113,13 +112,6 @@ public:
 private:
     static constexpr dfb::Vec3 unit{1, 1, 1};
     static constexpr std::uint32_t whole = std::numeric_limits<std::uint32_t>::max(); // the id of an uncut scene
-
-    static int sizeOf(MPI_Comm comm)
-    {
-        int size = 1;
-        MPI_Comm_size(comm, &size);
-        return size;
-    }
 
     const dfb::PerspectiveCamera& camera(int view) const { return cameras_[static_cast<std::size_t>(view)]; }
 

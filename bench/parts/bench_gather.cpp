@@ -206,10 +206,9 @@ struct Case {
 class GatherBench {
 public:
     GatherBench(MPI_Comm comm, bool quick, std::string trace)
-        : comm_(comm), quick_(quick), trace_(std::move(trace)), stepsPerSecond_(stepsPerSecond(comm)), tails_(head()),
-          frames_(head()), cpu_(head())
+        : comm_(comm), rank_(bench::rankIn(comm)), quick_(quick), trace_(std::move(trace)),
+          stepsPerSecond_(stepsPerSecond(comm)), tails_(head()), frames_(head()), cpu_(head())
     {
-        MPI_Comm_rank(comm, &rank_);
     }
 
     void run(const Case& c)
@@ -307,7 +306,7 @@ private:
     }
 
     MPI_Comm comm_;
-    int rank_ = 0;
+    int rank_;
     bool quick_;
     std::string trace_;
     double stepsPerSecond_;
@@ -323,23 +322,17 @@ int main(int argc, char** argv)
                                      "  --quick  fewer repetitions\n"
                                      "  PARTS    1: images of 1024², 2: 2048², 3: 4096²; 12: the first two\n"
                                      "           (default: all)");
-    int level = 0;
-    MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
-    bench::shortenNaps();
-    {
-        int rank = 0;
-        MPI_Comm_rank(MPI_COMM_WORLD, &rank);
-        if (rank == 0)
+    bench::withMpi(argc, argv, [&](MPI_Comm comm) {
+        if (bench::rankIn(comm) == 0)
             std::printf("bench_gather: %s. Medians ± median absolute deviations. A worker per rank.\n",
-                        bench::environment(MPI_COMM_WORLD).c_str());
-        GatherBench benchmark(MPI_COMM_WORLD, arguments.quick, arguments.trace);
+                        bench::environment(comm).c_str());
+        GatherBench benchmark(comm, arguments.quick, arguments.trace);
         for (int part = 0; part < 3; ++part)
             if (arguments.wants(static_cast<char>('1' + part)))
                 for (const auto format : {dfb::OutputFormat::RGBA8, dfb::OutputFormat::RGBA32F})
                     for (const Cost cost : costs)
                         benchmark.run({1024 << part, format, cost});
         benchmark.print();
-        bench::meet(MPI_COMM_WORLD);
-    }
-    MPI_Finalize();
+        bench::meet(comm);
+    });
 }

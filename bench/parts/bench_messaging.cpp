@@ -80,13 +80,9 @@ private:
 
 struct Group {
     MPI_Comm comm;
-    int rank = 0, size = 1;
+    int rank, size;
 
-    explicit Group(MPI_Comm c) : comm(c)
-    {
-        MPI_Comm_rank(comm, &rank);
-        MPI_Comm_size(comm, &size);
-    }
+    explicit Group(MPI_Comm c) : comm(c), rank(bench::rankIn(c)), size(bench::sizeOf(c)) {}
     int next() const { return (rank + 1) % size; }
     int previous() const { return (rank + size - 1) % size; }
 };
@@ -796,11 +792,8 @@ int main(int argc, char** argv)
         "  --quick  fewer repetitions\n"
         "  PARTS    1: latency and bandwidth, 2: processor time of waiting, 3: time that a computing thread loses,\n"
         "           4: more ranks than cores; 14: the first and the last (default: all)");
-    int level = 0;
-    MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
-    bench::shortenNaps();
-    {
-        const Group all(MPI_COMM_WORLD);
+    bench::withMpi(argc, argv, [&](MPI_Comm comm) {
+        const Group all(comm);
         if (all.size < 2) {
             std::printf("at least 2 ranks are needed\n");
             MPI_Abort(MPI_COMM_WORLD, 2);
@@ -830,6 +823,5 @@ int main(int argc, char** argv)
         if (arguments.wants('4'))
             hops(all, arguments.quick);
         bench::meet(all.comm);
-    }
-    MPI_Finalize();
+    });
 }

@@ -250,19 +250,6 @@ public:
 private:
     using Ordered = dfb::DistributedFrameBuffer<dfb::BasicOrderedBlend<64>>;
 
-    static int rankIn(MPI_Comm comm)
-    {
-        int rank = 0;
-        MPI_Comm_rank(comm, &rank);
-        return rank;
-    }
-    static int sizeOf(MPI_Comm comm)
-    {
-        int size = 1;
-        MPI_Comm_size(comm, &size);
-        return size;
-    }
-
     static std::function<std::array<double, 2>()> trafficOf(const std::shared_ptr<dfb::FrameReport>& report)
     {
         return [report] {
