@@ -94,15 +94,18 @@ struct System {
     std::string title() const { return name + ": " + config + ", to " + output; }
 };
 
-// Keeps the systems whose title has one of the texts in `only`, which are separated by |; all if it is empty.
-inline void keepWanted(std::vector<System>& systems, const std::string& only)
+// Whether a title has one of the texts in `only`, which are separated by |; all have if it is empty.
+inline bool isWanted(const std::string& title, const std::string& only)
 {
     const std::vector<std::string> parts = partsOf(only, '|');
-    const auto isUnwanted = [&](const System& s) {
-        return !parts.empty() && std::none_of(parts.begin(), parts.end(), [&](const std::string& part) {
-            return s.title().find(part) != std::string::npos;
-        });
-    };
+    return parts.empty() || std::any_of(parts.begin(), parts.end(), [&](const std::string& part) {
+               return title.find(part) != std::string::npos;
+           });
+}
+
+inline void keepWanted(std::vector<System>& systems, const std::string& only)
+{
+    const auto isUnwanted = [&](const System& s) { return !isWanted(s.title(), only); };
     systems.erase(std::remove_if(systems.begin(), systems.end(), isUnwanted), systems.end());
 }
 
@@ -206,15 +209,16 @@ inline dfb::FrameBufferConfig configOf(const Inputs& inputs, const DfbSettings& 
     return c;
 }
 
-// Adds a system with float output and one with 8-bit output. `start(toBytes)` makes its Compositor.
+// Adds a system with float output and one with 8-bit output. `settings`: of dfb. `start(toBytes)` makes its Compositor.
 template <class Start>
-void addToBoth(std::vector<System>& systems, const std::string& config, const DfbSettings& settings, const Start& start)
+void addToBoth(std::vector<System>& systems, const char* name, const std::string& config, const DfbSettings& settings,
+               const Start& start)
 {
     for (const bool toBytes : {false, true}) {
         if (settings.hasBytes && !toBytes)
             continue;
         System s;
-        s.name = "dfb";
+        s.name = name;
         s.config = config;
         s.output = toBytes ? "8 bit" : "float";
         s.isDefault = settings.isDefault;
@@ -256,7 +260,7 @@ inline void addImages(std::vector<System>& systems, const std::shared_ptr<Connec
         std::vector<DfbImage> images; // by view
         dfb::FrameReport report;
     };
-    addToBoth(systems, config, settings, [connection, blend, settings, &inputs](bool toBytes) {
+    addToBoth(systems, "dfb", config, settings, [connection, blend, settings, &inputs](bool toBytes) {
         dfb::FrameBufferConfig c = configOf(inputs, settings, toBytes);
         const Trace trace(inputs.trace);
         c.trace = trace.sink;
@@ -302,7 +306,7 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
         std::vector<DfbImage> images; // by view
         dfb::FrameReport report;
     };
-    addToBoth(systems, config, settings, [connection, settings, &inputs](bool toBytes) {
+    addToBoth(systems, "dfb", config, settings, [connection, settings, &inputs](bool toBytes) {
         dfb::FrameBufferConfig c = configOf(inputs, settings, toBytes);
         const Trace trace(inputs.trace);
         c.trace = trace.sink;
@@ -344,25 +348,18 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
 template <class Make>
 void addPlain(std::vector<System>& systems, const Inputs& inputs, const std::string& config, const Make& make)
 {
-    for (const bool toBytes : {false, true}) {
-        System s;
-        s.name = "plain";
-        s.config = config;
-        s.output = toBytes ? "8 bit" : "float";
-        s.start = [make, toBytes, &inputs] {
-            const std::shared_ptr<PlainCompositor> plain = make(toBytes);
-            const auto out = std::make_shared<const std::byte*>(nullptr);
-            Compositor compositor;
-            compositor.frame = [plain, out, &inputs] { *out = plain->composite(inputs.image().rgba); };
-            if (toBytes)
-                compositor.bytes = [out] { return reinterpret_cast<const std::uint8_t*>(*out); };
-            else
-                compositor.floats = [out] { return reinterpret_cast<const float*>(*out); };
-            compositor.traffic = [plain] { return std::make_pair(plain->bytesSent(), plain->messagesSent()); };
-            return compositor;
-        };
-        systems.push_back(std::move(s));
-    }
+    addToBoth(systems, "plain", config, {}, [make, &inputs](bool toBytes) {
+        const std::shared_ptr<PlainCompositor> plain = make(toBytes);
+        const auto out = std::make_shared<const std::byte*>(nullptr);
+        Compositor compositor;
+        compositor.frame = [plain, out, &inputs] { *out = plain->composite(inputs.image().rgba); };
+        if (toBytes)
+            compositor.bytes = [out] { return reinterpret_cast<const std::uint8_t*>(*out); };
+        else
+            compositor.floats = [out] { return reinterpret_cast<const float*>(*out); };
+        compositor.traffic = [plain] { return std::make_pair(plain->bytesSent(), plain->messagesSent()); };
+        return compositor;
+    });
 }
 
 inline void addDirectSend(std::vector<System>& systems, const Inputs& inputs)
@@ -375,22 +372,15 @@ inline void addDirectSend(std::vector<System>& systems, const Inputs& inputs)
 
 inline void addMemoryLimit(std::vector<System>& systems, const Inputs& inputs)
 {
-    for (const bool toBytes : {false, true}) {
-        System s;
-        s.name = "limit";
-        s.config = "inputs read, image written";
-        s.output = toBytes ? "8 bit" : "float";
-        s.start = [&inputs, toBytes] {
-            const auto limits = std::make_shared<std::vector<MemoryLimit>>();
-            for (const View& view : inputs.views)
-                limits->emplace_back(inputs.comm, view.viewports, toBytes);
-            Compositor compositor;
-            compositor.frame = [limits, &inputs] { (*limits)[inputs.frame % limits->size()].frame(inputs.image()); };
-            compositor.traffic = [] { return std::make_pair(std::int64_t{0}, std::int64_t{0}); };
-            return compositor;
-        };
-        systems.push_back(std::move(s));
-    }
+    addToBoth(systems, "limit", "inputs read, image written", {}, [&inputs](bool toBytes) {
+        const auto limits = std::make_shared<std::vector<MemoryLimit>>();
+        for (const View& view : inputs.views)
+            limits->emplace_back(inputs.comm, view.viewports, toBytes);
+        Compositor compositor;
+        compositor.frame = [limits, &inputs] { (*limits)[inputs.frame % limits->size()].frame(inputs.image()); };
+        compositor.traffic = [] { return std::make_pair(std::int64_t{0}, std::int64_t{0}); };
+        return compositor;
+    });
 }
 
 inline void addRadixK(std::vector<System>& systems, const Inputs& inputs, const std::string& name,
