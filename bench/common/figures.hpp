@@ -77,6 +77,14 @@ inline std::string text(double value)
     return out;
 }
 
+// As printf() writes it.
+inline std::string text(const char* format, double value)
+{
+    char out[64];
+    std::snprintf(out, sizeof out, format, value);
+    return out;
+}
+
 inline std::string text(const Figure& figure)
 {
     return figure.count == 0 ? "-" : text(figure.median) + " ±" + text(figure.deviation);
@@ -89,9 +97,11 @@ inline std::string byteText(std::size_t byteCount)
                                                                     : std::to_string(byteCount) + " B";
 }
 
-// Throws std::runtime_error if it cannot be written.
+// Does nothing if the path is empty. Throws std::runtime_error if the file cannot be written.
 inline void appendTo(const std::string& path, const std::string& what)
 {
+    if (path.empty())
+        return;
     std::ofstream file(path, std::ios::app);
     file << what;
     if (!file.flush())
@@ -129,7 +139,7 @@ public:
         return out;
     }
 
-    // Appends the table to a file.
+    // Appends the table to a file, if the path is not empty.
     void appendTo(const std::string& path, const std::string& title) const
     {
         bench::appendTo(path, '\n' + title + "\n\n" + text());

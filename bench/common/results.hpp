@@ -45,6 +45,7 @@ struct Result {
     }
 };
 
+// Does nothing if the path is empty.
 inline void appendJson(const std::string& path, const std::vector<Result>& results)
 {
     std::string lines;

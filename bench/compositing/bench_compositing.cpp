@@ -253,8 +253,7 @@ public:
             all.push_back(s.result);
             (s.output == "float" ? floats : bytes).push_back(s.result);
         }
-        if (!o_.json.empty())
-            bench::appendJson(o_.json, all);
+        bench::appendJson(o_.json, all);
         report(std::move(floats), "float", exact.rowStep);
         report(std::move(bytes), "8 bit", exact.rowStep);
     }
@@ -315,14 +314,10 @@ private:
             title += "; errors are those of every " + std::to_string(rowStep) + "th row";
         bench::Table table({"", "ms", "CPU ms", "yields", "MB sent", "messages", "max error", "RMSE", "levels off"});
         for (const Result& r : results) {
-            const auto format = [](const char* form, double value) {
-                char text[32];
-                std::snprintf(text, sizeof text, form, value);
-                return std::string(text);
-            };
             table.add({r.system + ": " + r.config, bench::text(r.ms), bench::text(r.cpuMs),
-                       bench::text(r.yieldMs.median), format("%.2f", r.bytes / 1e6), format("%.0f", r.messages),
-                       format("%.2g", r.maxError), format("%.2g", r.rmse), std::to_string(r.levels)});
+                       bench::text(r.yieldMs.median), bench::text("%.2f", r.bytes / 1e6),
+                       bench::text("%.0f", r.messages), bench::text("%.2g", r.maxError), bench::text("%.2g", r.rmse),
+                       std::to_string(r.levels)});
         }
         table.print(title);
 

@@ -277,10 +277,8 @@ public:
                        << " |\n";
         }
         std::printf("%s", all.str().c_str());
-        if (!o_.json.empty())
-            bench::appendJson(o_.json, results);
-        if (!o_.table.empty())
-            bench::appendTo(o_.table, chosen.str());
+        bench::appendJson(o_.json, results);
+        bench::appendTo(o_.table, chosen.str());
     }
 
 private:

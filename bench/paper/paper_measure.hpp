@@ -123,7 +123,7 @@ inline std::string sizeText(const Measurement& m)
     return std::to_string(m.result.width) + 'x' + std::to_string(m.result.height);
 }
 
-// Appends; throws std::runtime_error.
+// Appends to the files whose paths are not empty; throws std::runtime_error.
 inline void writeMeasurements(const std::vector<Measurement>& all, const std::string& caption,
                               const std::string& jsonPath, const std::string& tablePath)
 {
@@ -150,15 +150,11 @@ inline void writeMeasurements(const std::vector<Measurement>& all, const std::st
                  + (m.result.bytes > 0 ? text(1e-6 * m.result.bytes) : "-") + " |\n";
     }
     std::printf("\n%s\n", table.c_str());
-    const auto append = [](const std::string& path, const std::string& what) {
-        if (!path.empty())
-            bench::appendTo(path, what);
-    };
     std::string lines;
     for (const Measurement& m : all)
         lines += m.json() + '\n';
-    append(jsonPath, lines);
-    append(tablePath, table + '\n');
+    appendTo(jsonPath, lines);
+    appendTo(tablePath, table + '\n');
 }
 
 } // namespace bench

@@ -179,7 +179,7 @@ private:
     std::shared_ptr<dfb::Connection> connection_;
     dfb::FrameBufferConfig config_;
     std::vector<dfb::PerspectiveCamera> cameras_;
-    int width_, height_, rank_ = 0;
+    int width_, height_, rank_;
     BrickGrid grid_;
     int ranks_;
     std::map<std::uint32_t, std::unique_ptr<PaperBrick>> bricks_; // that this rank holds, by id

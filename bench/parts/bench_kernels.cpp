@@ -577,13 +577,6 @@ private:
     std::vector<Run> aggregates_;
 };
 
-std::string number(const char* format, double value)
-{
-    char text[32];
-    std::snprintf(text, sizeof text, format, value);
-    return text;
-}
-
 // The table, also into the file `tablePath`, and JSON lines into `json`, if these are not empty.
 void report(const Reporter& reporter, const std::string& json, const std::string& tablePath)
 {
@@ -609,27 +602,27 @@ void report(const Reporter& reporter, const std::string& json, const std::string
         const bool isMet = isTime ? ratio <= kernel.target : ratio >= kernel.target;
         const bool wasAsked = kernel.target > 0 && ratio > 0;
         table.add({kernel.name, bench::text({1e6 * time.median, 1e6 * time.deviation, time.count}),
-                   isTime ? "" : number("%.1f", speed), ratio > 0 ? number(ratio < 0.1 ? "%.3f" : "%.2f", ratio) : "",
+                   isTime ? "" : bench::text("%.1f", speed),
+                   ratio > 0 ? bench::text(ratio < 0.1 ? "%.3f" : "%.2f", ratio) : "",
                    ratio > 0 ? (isTime ? "time of " : "") + kernel.against : "",
-                   kernel.target > 0 ? (isTime ? "<= " : ">= ") + number("%.2f", kernel.target) : "",
+                   kernel.target > 0 ? (isTime ? "<= " : ">= ") + bench::text("%.2f", kernel.target) : "",
                    wasAsked ? isMet ? "yes" : "no" : ""});
         if (json.empty())
             continue;
         file << R"({"bench": "kernels", "system": ")" << (isPlain(kernel) ? "memcpy" : "dfb") << R"(", "config": ")"
-             << kernel.name << R"(", "median_ms": )" << number("%.7f", 1e3 * time.median) << R"(, "mad_ms": )"
-             << number("%.7f", 1e3 * time.deviation) << R"(, "bytes": )" << number("%.0f", kernel.bytes)
-             << R"(, "gb_per_s": )" << number("%.4g", speed);
+             << kernel.name << R"(", "median_ms": )" << bench::text("%.7f", 1e3 * time.median) << R"(, "mad_ms": )"
+             << bench::text("%.7f", 1e3 * time.deviation) << R"(, "bytes": )" << bench::text("%.0f", kernel.bytes)
+             << R"(, "gb_per_s": )" << bench::text("%.4g", speed);
         if (ratio > 0)
-            file << R"(, "ratio": )" << number("%.4g", ratio) << R"(, "ratio_of": ")" << (isTime ? "time" : "speed")
-                 << R"(", "ratio_to": ")" << kernel.against << '"';
+            file << R"(, "ratio": )" << bench::text("%.4g", ratio) << R"(, "ratio_of": ")"
+                 << (isTime ? "time" : "speed") << R"(", "ratio_to": ")" << kernel.against << '"';
         if (kernel.target > 0)
-            file << R"(, "target": )" << number("%g", kernel.target);
+            file << R"(, "target": )" << bench::text("%g", kernel.target);
         file << "}\n";
     }
     const char* title = "Medians of the thread's CPU time ± median absolute deviation; bytes are of the input:";
     table.print(title);
-    if (!tablePath.empty())
-        table.appendTo(tablePath, title);
+    table.appendTo(tablePath, title);
     if (!json.empty() && !file.flush())
         throw std::runtime_error("cannot write " + json);
 }

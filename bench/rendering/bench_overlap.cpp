@@ -32,10 +32,9 @@ struct Options {
 
 class Bench {
 public:
-    Bench(MPI_Comm comm, Options o) : comm_(comm), o_(std::move(o))
+    Bench(MPI_Comm comm, Options o)
+        : comm_(comm), o_(std::move(o)), rank_(bench::rankIn(comm)), size_(bench::sizeOf(comm))
     {
-        MPI_Comm_rank(comm, &rank_);
-        MPI_Comm_size(comm, &size_);
     }
 
     void run(int width, int height)
@@ -53,9 +52,10 @@ public:
                 systems.push_back(bricks.icet(strategy));
         }
 #endif
-        systems.erase(std::remove_if(systems.begin(), systems.end(),
-                                     [&](const MarchedSystem& s) { return s.image && !isWanted(s.name); }),
-                      systems.end());
+        systems.erase(
+            std::remove_if(systems.begin(), systems.end(),
+                           [&](const MarchedSystem& s) { return s.image && !bench::isWanted(s.name, o_.only); }),
+            systems.end());
         bench::FrameTimer timer(comm_);
         double largest = 0; // difference of two images
         const auto views = static_cast<std::size_t>(o_.views);
@@ -147,8 +147,7 @@ public:
         const std::string title = std::to_string(width) + 'x' + std::to_string(height) + ", " + std::to_string(size_)
                                   + " ranks, " + std::to_string(o_.views) + " views in a row";
         table.print(title);
-        if (!o_.json.empty())
-            bench::appendJson(o_.json, results);
+        bench::appendJson(o_.json, results);
     }
 
 private:
@@ -205,15 +204,11 @@ private:
         }
         const std::string size = std::to_string(width) + 'x' + std::to_string(height);
         std::string title = size + ", " + std::to_string(size_) + " ranks, " + std::to_string(o_.views) + " views";
-        if (systems.size() > 2) {
-            char difference[32];
-            std::snprintf(difference, sizeof difference, "%.2g", largest);
-            title += "; images of " + systems[1].name + " and " + systems.back().name + " differ by " + difference
-                     + " at most";
-        }
+        if (systems.size() > 2)
+            title += "; images of " + systems[1].name + " and " + systems.back().name + " differ by "
+                     + bench::text("%.2g", largest) + " at most";
         table.print(title);
-        if (!o_.json.empty())
-            bench::appendJson(o_.json, results);
+        bench::appendJson(o_.json, results);
         std::size_t best = 0; // of the peer's
         for (std::size_t i = 2; i < rows.size(); ++i)
             if (best == 0 || rows[i].frame.median < rows[best].frame.median)
@@ -233,23 +228,12 @@ private:
                            "rendering | IceT CPU beyond |\n"
                            "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n";
         std::printf("\n%s%s", head, line.c_str());
-        if (o_.table.empty())
-            return;
         bench::appendTo(o_.table, (bench::hasTable(o_.table) ? "" : head) + line);
-    }
-
-    // Whether a system was asked for by a part of its name.
-    bool isWanted(const std::string& name) const
-    {
-        const std::vector<std::string> parts = bench::partsOf(o_.only, '|');
-        return parts.empty() || std::any_of(parts.begin(), parts.end(), [&](const std::string& part) {
-                   return name.find(part) != std::string::npos;
-               });
     }
 
     MPI_Comm comm_;
     Options o_;
-    int rank_ = 0, size_ = 1;
+    int rank_, size_;
 };
 
 // Ends the program after --help, or if it was called wrongly.

@@ -477,8 +477,7 @@ public:
         for (const std::string& scene : o_.scenes)
             count(scene);
         estimate();
-        if (!o_.json.empty())
-            bench::appendJson(o_.json, results_);
+        bench::appendJson(o_.json, results_);
         std::printf("\n%s\n", failures_ == 0 ? "All counts are those of the formulas."
                                              : "SOME COUNTS ARE NOT THOSE OF THE FORMULAS.");
         return failures_ == 0 ? 0 : 1;
@@ -670,8 +669,7 @@ private:
     void print(const bench::Table& table, const std::string& title) const
     {
         table.print(title);
-        if (!o_.table.empty())
-            table.appendTo(o_.table, title);
+        table.appendTo(o_.table, title);
     }
 
     Options o_;

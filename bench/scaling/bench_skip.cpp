@@ -38,6 +38,7 @@ namespace {
 using bench::Figure;
 using bench::Kind;
 using bench::MessageCount;
+using bench::text;
 
 constexpr int ranks = 4;
 
@@ -421,13 +422,6 @@ struct Options {
     std::string framesOf, json, svg, table, trace, commit;
 };
 
-std::string text(const char* form, double value)
-{
-    char out[64];
-    std::snprintf(out, sizeof out, form, value);
-    return out;
-}
-
 class Bench {
 public:
     explicit Bench(Options options) : o_(std::move(options)) {}
@@ -441,10 +435,8 @@ public:
         measureConverged();
         const std::string title = "Claims, " + sizeText();
         claims_.print(title);
-        if (!o_.table.empty())
-            claims_.appendTo(o_.table, title);
-        if (!o_.json.empty())
-            bench::appendJson(o_.json, results_);
+        claims_.appendTo(o_.table, title);
+        bench::appendJson(o_.json, results_);
         std::printf("\n%s\n", failures_ == 0 ? "All claims hold that are counted." : "SOME CLAIMS DO NOT HOLD.");
         return failures_ == 0 ? 0 : 1;
     }
@@ -519,8 +511,7 @@ private:
         const std::string title =
             "A frame as less of it is active, " + sizeText() + ", 4 ranks of which each has it all";
         table.print(title);
-        if (!o_.table.empty())
-            table.appendTo(o_.table, title);
+        table.appendTo(o_.table, title);
         if (!o_.svg.empty())
             bench::writePlot(o_.svg, "A frame as less of it is active, " + sizeText() + ", 4 ranks",
                              "active pixels [% of the image]", "% of a full frame", {bytesLine, timeLine}, false);
