@@ -325,11 +325,8 @@ private:
     {
         try {
             answer();
-        } catch (const Refused& why) {
-            response.status = 400;
-            response.set_content(std::string(why.what()) + '\n', "text/plain");
         } catch (const std::exception& why) {
-            response.status = 500;
+            response.status = dynamic_cast<const Refused*>(&why) ? 400 : 500;
             response.set_content(std::string(why.what()) + '\n', "text/plain");
         }
     }
