@@ -6,7 +6,6 @@
 
 #include <dfb/dfb.hpp>
 
-#include <array>
 #include <cmath>
 #include <cstdint>
 #include <cstdio>

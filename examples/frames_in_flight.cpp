@@ -11,7 +11,6 @@
 #include <deque>
 #include <exception>
 #include <string>
-#include <utility>
 #include <vector>
 
 namespace {

@@ -8,7 +8,6 @@
 
 #include <dfb/blend/compositing.hpp>
 
-#include <fstream>
 #include <memory>
 #include <sstream>
 

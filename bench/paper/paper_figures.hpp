@@ -5,7 +5,6 @@
 #include "paper_plots.hpp"
 
 #include <algorithm>
-#include <cstddef>
 #include <iterator>
 #include <string>
 #include <utility>

@@ -11,11 +11,8 @@
 #include <array>
 #include <cstddef>
 #include <cstdio>
-#include <fstream>
 #include <functional>
-#include <stdexcept>
 #include <string>
-#include <utility>
 #include <vector>
 
 namespace bench {

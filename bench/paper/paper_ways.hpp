@@ -10,7 +10,6 @@
 #include <dfb/dfb.hpp>
 
 #include <array>
-#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <functional>

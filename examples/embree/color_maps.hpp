@@ -4,7 +4,6 @@
 #include "mesh.hpp"
 #include "transfer_function.hpp"
 
-#include <array>
 #include <cstdint>
 #include <string>
 #include <vector>

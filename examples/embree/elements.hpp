@@ -3,9 +3,7 @@
 
 #include "vec.hpp"
 
-#include <algorithm>
 #include <array>
-#include <cctype>
 #include <cmath>
 #include <cstddef>
 #include <string_view>

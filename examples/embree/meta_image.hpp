@@ -3,8 +3,6 @@
 
 #include "header_lines.hpp"
 
-#include <optional>
-
 namespace example {
 
 namespace detail {

@@ -10,7 +10,6 @@
 #include <dfb/wire/wire_format.hpp>
 
 #include <array>
-#include <cstdint>
 #include <optional>
 #include <string>
 #include <utility>

@@ -13,7 +13,6 @@
 #include "volume.hpp"
 
 #include <cstdint>
-#include <cstdio>
 #include <limits>
 #include <string>
 #include <utility>

@@ -10,7 +10,6 @@
 #include <istream>
 #include <stdexcept>
 #include <string>
-#include <string_view>
 
 namespace example {
 

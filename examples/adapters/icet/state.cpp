@@ -2,7 +2,6 @@
 #include "context.hpp"
 #include "errors.hpp"
 
-#include <algorithm>
 #include <cstdio>
 #include <cstring>
 #include <set>
