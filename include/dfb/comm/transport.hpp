@@ -9,9 +9,10 @@
 //   bool needsPolling() const;                  false: messages are delivered without poll()
 //   bool mayPoll() const;                       whether the calling thread may call poll()
 //   void start(TransportHandler&);              from now on the handler may be called
-//   void send(int destination, Buffer&&);       after start(). Any thread. Never blocks. `destination` is another rank.
-//                                               A message arrives once; messages arrive in any order. They may have any
-//                                               size, also 0. A message to a rank that has stopped is dropped
+//   void send(int destination, Buffer&&);       after start(). Any thread. Never blocks nor throws TransportError.
+//                                               `destination` is another rank. A message arrives once; messages arrive
+//                                               in any order. They may have any size, also 0. A message to a rank that
+//                                               has stopped is dropped
 //   bool poll();                                between start() and stop(), one thread at a time. Never blocks. Sends
 //                                               and receives what it can, and calls the handler. Returns whether
 //                                               anything moved

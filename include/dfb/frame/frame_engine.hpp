@@ -409,10 +409,11 @@ private:
         // A pixel operation that is not pointwise wants to see tiles without samples, too.
         const auto isKept = [this](int tile) { return !traits().pixelOpIsPointwise && samples(tile).count == 0; };
         const auto& tiles = ownedNow();
-        auto& early = open_.open();
-        open_.expectTiles(std::count_if(tiles.begin(), tiles.end(), [&](int tile) {
+        const auto expected = std::count_if(tiles.begin(), tiles.end(), [&](int tile) {
             return isKept(tile) || (!params_.declared && samples(tile).count > 0);
-        }));
+        });
+        auto& early = open_.open();
+        open_.expectTiles(expected);
         if (userError) // end() throws it on all ranks; nothing is made with half of the frame's data
             outcome_->failWhole(errorInfoOf(userError, {}));
         for (Arrival& a : early)

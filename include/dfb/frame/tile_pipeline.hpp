@@ -276,6 +276,8 @@ public:
             table_.setFinished(tile);
         const TileReport report = table_.report(tile);
         const double bound = isLossy() ? losses_.boundOf(tile, std::max(1, table_.samples(tile).count)) : 0;
+        if (report.error < 0 && report.orderUndefinedPixels == 0 && bound == 0)
+            return;
         const std::lock_guard<std::mutex> lock(reportsMutex_);
         if (report.error >= 0)
             errors_.push_back({static_cast<std::uint64_t>(tile), report.error});

@@ -20,6 +20,7 @@
 #include <map>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -781,6 +782,45 @@ TEST_CASE("A reduction that no rank can be at is malformed, and nobody waits for
         for (const std::string& text : texts)
             CHECK(has(text, "TransportError: dfb: malformed message"));
     }
+}
+
+namespace {
+
+// An owner that has no memory for any message.
+class NoMemory final : private dfb::detail::MailboxOwner {
+public:
+    explicit NoMemory(const std::shared_ptr<dfb::Connection>& connection)
+        : mailbox_(connection, std::make_shared<dfb::ThreadExecutor>(1), std::size_t{1} << 20, *this)
+    {
+        mailbox_.start();
+    }
+    ~NoMemory() { mailbox_.stop(); }
+
+    dfb::detail::Mailbox& mailbox() { return mailbox_; }
+
+private:
+    void incoming(int, const MessageHeader&, dfb::Buffer&&) override { throw std::bad_alloc(); }
+    void undecodable(const dfb::ErrorInfo&) override {}
+
+    dfb::detail::Mailbox mailbox_;
+};
+
+} // namespace
+
+TEST_CASE("Where there is no memory for a message, the connection fails on all ranks", "[messaging]")
+{
+    std::vector<std::string> texts(2);
+    runOn(std::make_shared<Board>(), 2, [&](const auto& communicator) {
+        const auto connection = dfb::connect<BoardTransport>(communicator);
+        NoMemory object(connection);
+        if (connection->rank() == 0)
+            object.mailbox().send(1, MessageKind::TilesDone, 0);
+        texts[static_cast<std::size_t>(connection->rank())] =
+            outcomeOf([&] { object.mailbox().wait([] { return false; }); });
+    });
+    INFO(joined(texts));
+    for (const std::string& text : texts)
+        CHECK(has(text, std::bad_alloc().what()));
 }
 
 TEST_CASE("A reduction's result is malformed where nothing was given to it", "[messaging]")
