@@ -732,8 +732,8 @@ private:
     {
         const std::int64_t begun = reductionCount_, number = header.number;
         const bool isLast = number >= 0 && number == begun - 1;
-        const bool isNext = number == begun && header.kind == MessageKind::ReduceUp
-                            && reductions_.missing({ownScope, begun - 1}).empty();
+        const bool isNext =
+            number == begun && header.kind == MessageKind::ReduceUp && !reductions_.isUnderWay({ownScope, begun - 1});
         if (!isLast && !isNext)
             failMalformed("a reduction that no rank can be at", begun, number);
     }

@@ -59,7 +59,7 @@ public:
     }
 
     // Takes part with `own`. Every rank does so once per key; it may use the key again when it has got the result.
-    // `done` gets the result, which is the same on all ranks.
+    // `done` gets the result, which is the same on all ranks. Neither function may be empty.
     void enter(const ReductionKey& key, Bytes own, Combine combine, Done done)
     {
         std::unique_lock<std::mutex> lock(mutex_);
@@ -94,6 +94,12 @@ public:
         } else {
             detail::failMalformed("a reduction's result where it was not entered", -1, source);
         }
+    }
+
+    bool isUnderWay(const ReductionKey& key)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return find(key) != nullptr;
     }
 
     // A message that this rank waits for in a reduction that it has entered: a part from a child, which stands for the
