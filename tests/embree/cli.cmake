@@ -94,10 +94,10 @@ _add_cli_case(trace ranks1 ranks3 np3)
 _add_cli_case(loading ranks1 ranks3 np4)
 _add_cli_case(frames ranks3 np3)
 _add_cli_case(no_output one np3)
-_add_cli_case(algorithms ranks7 np2) # more ranks than bricks, and fewer
+_add_cli_case(algorithms ranks2 np4) # fewer ranks than bricks, and more
 _add_cli_case(precision ranks3 np4)
 _add_cli_case(wall_and_aux ranks3 np4)
-_add_cli_case(png ranks2)
+_add_cli_case(png ranks2 np3)
 _add_cli_case(far ranks3 np3)
 if(TARGET dfb::mpi) # processes share nothing of what they read
   _add_cli_case(look np3)

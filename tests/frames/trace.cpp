@@ -172,8 +172,8 @@ struct TraceAgrees {
             reports.push_back(second.end());
         }
         std::vector<Records> ranks = traced.all();
-        for (int round = 0; round < 500 && isAnyUnderWay(ranks); ++round) { // the same on all ranks
-            std::this_thread::sleep_for(std::chrono::milliseconds(10));
+        for (int round = 0; round < 50 && isAnyUnderWay(ranks); ++round) { // the same on all ranks
+            std::this_thread::sleep_for(std::chrono::milliseconds(100));
             ranks = traced.all();
         }
         for (const Records& records : ranks)

@@ -74,15 +74,16 @@ public:
 };
 
 // Call it before the first frame: an owner that hears where the image lies after that frame goes on sending its tiles.
-// Collective.
+// Collective. Returns whether all have heard in time.
 template <class Fb>
-void waitForPlace(Fb& fb, const PlaceSink& sink)
+bool waitForPlace(Fb& fb, const PlaceSink& sink)
 {
     for (int round = 0; round < 3000; ++round) {
         if (fb.allReduce({fb.isDisplayRank() || sink.hasHeard}, dfb::Reduce::Min).front() == 1)
-            return;
+            return true;
         std::this_thread::sleep_for(std::chrono::milliseconds(10));
     }
+    return false;
 }
 
 template <class Fb>
@@ -108,7 +109,7 @@ TEST_CASE("Owners that see the image of the display rank send it no tiles", "[sh
         options.sharedMemory = shared;
         dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config, options);
         if (shared && others > 0)
-            waitForPlace(fb, *sink);
+            CHECK(waitForPlace(fb, *sink));
         dfb::FrameReport report;
         for (int i = 0; i < 4; ++i)
             CHECK(goodFrame(fb, s, report));
@@ -132,7 +133,7 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
         const auto sink = std::make_shared<PlaceSink>();
         config.trace = sink;
         dfb::DistributedFrameBuffer<SlowBlend> fb(MPI_COMM_WORLD, config);
-        waitForPlace(fb, *sink);
+        result.expect(waitForPlace(fb, *sink), "not all hear where the image lies");
         dfb::FrameReport report;
         for (int i = 0; i < 2; ++i)
             result.expect(goodFrame(fb, s, report), "a frame before");
