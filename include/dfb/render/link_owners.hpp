@@ -37,16 +37,16 @@ public:
     void start(const TileLayout& layout)
     {
         layout_ = layout;
-        parts_.resize(static_cast<std::size_t>(layout.tileCount()));
-        for (std::vector<Part>& parts : parts_)
-            parts.clear();
+        found_.clear();
+        first_.assign(static_cast<std::size_t>(layout.tileCount()) + 1, 0);
     }
 
     // Some pixels of a tile come from one of `rankCount` ranks; nobody knows from which. `ranks` must stay until
     // find().
     void add(int tile, const Region& pixels, const int* ranks, std::size_t rankCount)
     {
-        parts_[static_cast<std::size_t>(tile)].push_back({ranks, rankCount, areaOf(pixels)});
+        found_.push_back({tile, ranks, rankCount, areaOf(pixels)});
+        ++first_[static_cast<std::size_t>(tile) + 1];
     }
 
     // Returns the owner of each tile. `hasDepth`: whether inputs have depth. `elsewhere(tile)` gives the owners of
@@ -55,6 +55,7 @@ public:
 
 private:
     struct Part {
+        int tile = 0;
         const int* ranks = nullptr;
         std::size_t rankCount = 0;
         double pixels = 0;
@@ -66,7 +67,12 @@ private:
     static double areaOf(const Region& r) { return static_cast<double>(r.width()) * static_cast<double>(r.height()); }
     int nodeOf(int rank) const { return nodeOf_[static_cast<std::size_t>(rank)]; }
     Link& linkOf(int node) { return links_[static_cast<std::size_t>(node)]; }
-    const std::vector<Part>& partsOf(int tile) const { return parts_[static_cast<std::size_t>(tile)]; }
+    // The parts of a tile.
+    const Part* begin(int tile) const { return parts_.data() + first_[static_cast<std::size_t>(tile)]; }
+    const Part* end(int tile) const { return begin(tile + 1); }
+    bool isAnywhere(int tile) const { return begin(tile) != end(tile); }
+
+    void sortByTile();
 
     void place(int tile);
 
@@ -116,7 +122,8 @@ private:
     TileLayout layout_;
     double inputBytes_ = 0, imageBytes_ = 0; // bytes of a pixel: to the owner, and to the display rank
     int displayNode_ = 0;
-    std::vector<std::vector<Part>> parts_;     // of each tile
+    std::vector<Part> found_, parts_;          // parts_: tile by tile
+    std::vector<std::size_t> first_, next_;    // for each tile, an index into parts_
     std::vector<std::pair<int, double>> from_; // nodes, and how many bytes of a tile come from each
     std::vector<Link> links_;                  // of each node
     std::vector<double> work_;                 // pixels that each rank has to blend
@@ -128,6 +135,7 @@ private:
 DFB_COMPILED_ONCE TileOwners LinkOwners::find(const FrameBufferConfig& config, bool hasDepth,
                                               FunctionRef<int(int)> elsewhere)
 {
+    sortByTile();
     const ImageConfig& image = config.image;
     inputBytes_ = 4.0 * static_cast<double>(bytesOf(config.precision.color)) + 4 * (hasDepth || image.depth);
     imageBytes_ = static_cast<double>(bytesPerPixel(image.format)) + 4 * image.depth;
@@ -137,14 +145,24 @@ DFB_COMPILED_ONCE TileOwners LinkOwners::find(const FrameBufferConfig& config, b
     nodes_.assign(static_cast<std::size_t>(layout_.tileCount()), -1);
     for (int sweep = 0; sweep < 2; ++sweep) // the second time, each tile is placed knowing all others
         for (int tile = 0; tile < layout_.tileCount(); ++tile)
-            if (!partsOf(tile).empty())
+            if (isAnywhere(tile))
                 place(tile);
     owners_.clear();
     for (int tile = 0; tile < layout_.tileCount(); ++tile)
-        owners_.push_back(partsOf(tile).empty() ? elsewhere(tile) : leastBusy(tile));
+        owners_.push_back(isAnywhere(tile) ? leastBusy(tile) : elsewhere(tile));
     if (!last_ || *last_ != owners_)
         last_ = std::make_shared<const std::vector<int>>(owners_);
     return last_;
+}
+
+DFB_COMPILED_ONCE void LinkOwners::sortByTile()
+{
+    for (std::size_t tile = 1; tile < first_.size(); ++tile)
+        first_[tile] += first_[tile - 1];
+    parts_.resize(found_.size());
+    next_ = first_;
+    for (const Part& part : found_)
+        parts_[next_[static_cast<std::size_t>(part.tile)]++] = part;
 }
 
 // Gives a tile to the node with which the sum of the squares of all links' loads is least. The node has pixels of the
@@ -154,10 +172,10 @@ DFB_COMPILED_ONCE void LinkOwners::place(int tile)
     double pixels = 0;
     from_.clear();
     addFrom(displayNode_, 0);
-    for (const Part& part : partsOf(tile)) {
-        pixels += part.pixels;
-        for (std::size_t i = 0; i < part.rankCount; ++i)
-            addFrom(nodeOf(part.ranks[i]), inputBytes_ * part.pixels / static_cast<double>(part.rankCount));
+    for (const Part* part = begin(tile); part != end(tile); ++part) {
+        pixels += part->pixels;
+        for (std::size_t i = 0; i < part->rankCount; ++i)
+            addFrom(nodeOf(part->ranks[i]), inputBytes_ * part->pixels / static_cast<double>(part->rankCount));
     }
     const double finished = imageBytes_ * std::min(pixels, areaOf(layout_.region(tile)));
     int& node = nodes_[static_cast<std::size_t>(tile)];
@@ -179,8 +197,8 @@ DFB_COMPILED_ONCE int LinkOwners::leastBusy(int tile)
     const auto& ranks = ranksOf_[static_cast<std::size_t>(nodes_[static_cast<std::size_t>(tile)])];
     const auto workOf = [this](int rank) -> double& { return work_[static_cast<std::size_t>(rank)]; };
     const int best = *std::min_element(ranks.begin(), ranks.end(), [&](int a, int b) { return workOf(a) < workOf(b); });
-    for (const Part& part : partsOf(tile))
-        workOf(best) += part.pixels;
+    for (const Part* part = begin(tile); part != end(tile); ++part)
+        workOf(best) += part->pixels;
     return best;
 }
 #endif

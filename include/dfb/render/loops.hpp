@@ -224,7 +224,7 @@ private:
             sources_.push_back(bricks[static_cast<std::size_t>(brick)].id);
         if (!order_ || sources_ != orderSources_) {
             order_ = std::make_shared<const SourceOrder>(sources_);
-            orderSources_ = sources_;
+            orderSources_.swap(sources_);
         }
         config.order = order_;
     }

@@ -284,7 +284,8 @@ struct OrderedWork : MixedWork {
     void forEachRankBehind(const SharedWorld& world, const Job& job, Owner& owner, const F& f) const
     {
         const int tile = pairs[job.item].tile;
-        static thread_local std::vector<int> told;
+        static thread_local std::vector<int> spare; // not used itself, as owner() may do other work meanwhile
+        std::vector<int> told = std::move(spare);
         told.clear();
         for (std::size_t p = job.item + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
             const int rank = owner(brickOf(world, pairs[p]), tile, 0);
@@ -293,6 +294,7 @@ struct OrderedWork : MixedWork {
             f(generationOf(job) + 1, rank);
             told.push_back(rank);
         }
+        spare = std::move(told);
     }
 };
 
