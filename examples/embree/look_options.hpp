@@ -70,7 +70,7 @@ public:
             const std::size_t axis = std::string("xyz").find(isDown ? up_.substr(1) : up_);
             if (up_.size() == (isDown ? 2u : 1u) && axis != std::string::npos) {
                 view.up = {0, 0, 0};
-                component(view.up, static_cast<int>(axis)) = isDown ? -1.0f : 1.0f;
+                component(view.up, axis) = isDown ? -1.0f : 1.0f;
             } else {
                 view.up = point("--up", up_);
             }

@@ -6,6 +6,7 @@
 #include "forward.hpp"
 #include "random_scene.hpp"
 
+#include <dfb/comm/mailbox.hpp>
 #include <dfb/comm/reduction.hpp>
 
 #include <algorithm>
