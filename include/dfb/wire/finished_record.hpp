@@ -155,15 +155,6 @@ private:
         return alignedTo16(sizeof(Header) + fillerBytes(shape) + bodyBytes(shape));
     }
 
-    bool areAlike(const FinishedPlanes& planes, std::size_t a, std::size_t b) const
-    {
-        for (std::size_t c = 0; c < channelCount; ++c)
-            if (const std::size_t bytes = pixelBytes(c);
-                bytes > 0 && std::memcmp(planes.planes.at[c] + bytes * a, planes.planes.at[c] + bytes * b, bytes) != 0)
-                return false;
-        return true;
-    }
-
     // The corner pixel that equals most other corners. Background, if there is any, is usually found in the corners.
     std::size_t fillerOf(const Region& region, const FinishedPlanes& planes) const
     {
@@ -172,7 +163,7 @@ private:
         const std::array<std::size_t, 4> corners{0, right, bottom, bottom + right};
         const auto likes = [&](std::size_t corner) {
             return std::count_if(corners.begin(), corners.end(),
-                                 [&](std::size_t other) { return areAlike(planes, corner, other); });
+                                 [&](std::size_t other) { return findDifferent(planes, other, corner, 1) == 0; });
         };
         return *std::max_element(corners.begin(), corners.end(),
                                  [&](std::size_t a, std::size_t b) { return likes(a) < likes(b); });
