@@ -169,24 +169,18 @@ struct MixedWork {
     std::vector<int> passes;        // how many passes each pair has
     std::vector<Job> jobs;          // of this rank; `item` is an index into `pairs`
 
-    // The most bricks that meet in a tile.
-    int mostPerTile() const
-    {
-        int most = 1, count = 0;
-        for (std::size_t p = 0; p < pairs.size(); ++p) {
-            count = p > 0 && pairs[p].tile == pairs[p - 1].tile ? count + 1 : 1;
-            most = std::max(most, count);
-        }
-        return most;
-    }
-
-    // Finds the jobs that `owner` gives to the rank `own`.
+    // Finds the jobs that `owner` gives to the rank `own`. Tells the frame how many bricks meet in a tile.
     template <class Frame, class Owner>
-    void findJobs(const Frame& frame, const SharedWorld& world, Owner& owner, int own)
+    void findJobs(Frame& frame, const SharedWorld& world, Owner& owner, int own)
     {
         passes.clear();
-        for (const BrickInTile& pair : pairs)
-            passes.push_back(frame.samples(pair.tile).count);
+        int inTile = 0, most = 1;
+        for (std::size_t p = 0; p < pairs.size(); ++p) {
+            passes.push_back(frame.samples(pairs[p].tile).count);
+            inTile = p > 0 && pairs[p].tile == pairs[p - 1].tile ? inTile + 1 : 1;
+            most = std::max(most, inTile);
+        }
+        frame.expectLayers(most);
         if constexpr (has_plan_v<Owner>)
             owner.plan(world, pairs, passes);
         jobs.clear();
@@ -342,7 +336,6 @@ public:
         auto frame = fb_.begin(params, tileData, pixelData, failure);
         frame.guard([&] {
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
-            frame.expectLayers(work_.mostPerTile());
             work_.findJobs(frame, world_, owner_, fb_.rank());
             // The first rank that holds the brick declares the tile, even if another one renders it.
             inputs_.clear();
@@ -413,7 +406,6 @@ public:
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             work_.sortFrontToBack(world_, order);
             work_.findJobs(frame, world_, owner_, fb_.rank());
-            frame.expectLayers(work_.mostPerTile());
             work_.findEmpty(fb_.layout().tileCount(), frame.ownedTiles());
             frame.template forEachTile<typename FrameBuffer::TileView>(work_.empty,
                                                                        [&](const auto& tile) { frame.setTile(tile); });
