@@ -118,10 +118,10 @@ public:
     static constexpr auto capacity = static_cast<std::size_t>(std::uint64_t{1} << 32); // 0 where it has 32 bits
     static constexpr std::size_t alignment = 64;
 
+#if defined(MFD_CLOEXEC)
     // Returns null if the system has no such memory.
     static std::shared_ptr<NodeMemory> create()
     {
-#if defined(MFD_CLOEXEC)
         rlimit longest; // a longer file would end the process by a signal
         if (getrlimit(RLIMIT_FSIZE, &longest) != 0 || longest.rlim_cur < capacity)
             return nullptr;
@@ -140,16 +140,12 @@ public:
         std::memcpy(base, address.secret, sizeof address.secret);
         new (&memory->doorbell()) Doorbell;
         return memory;
-#else
-        return nullptr;
-#endif
     }
 
     // Opens the memory of another process, or of this one. Blocks can be borrowed there and given back, but not taken.
     // Returns null if it cannot be reached.
     static std::shared_ptr<NodeMemory> open(const Address& address)
     {
-#if defined(MFD_CLOEXEC)
         const std::string path = "/proc/" + std::to_string(address.process) + "/fd/" + std::to_string(address.file);
         const int file = ::open(path.c_str(), O_RDWR | O_CLOEXEC);
         if (file < 0)
@@ -160,18 +156,19 @@ public:
         close(file);
         std::shared_ptr<NodeMemory> memory(new NodeMemory(base, -1));
         return base && std::memcmp(base, address.secret, sizeof address.secret) == 0 ? memory : nullptr;
-#else
-        (void)address;
-        return nullptr;
-#endif
     }
+#else
+    static std::shared_ptr<NodeMemory> create() { return nullptr; }
+    static std::shared_ptr<NodeMemory> open(const Address&) { return nullptr; }
+#endif
 
     NodeMemory(const NodeMemory&) = delete;
     NodeMemory& operator=(const NodeMemory&) = delete;
     ~NodeMemory()
     {
-        unmap(base_);
 #if defined(MFD_CLOEXEC)
+        if (base_)
+            munmap(base_, capacity);
         if (file_ >= 0)
             close(file_);
 #endif
@@ -270,7 +267,7 @@ private:
             munmap(base + capacity, rest);
         if (mmap(base, capacity, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_NORESERVE | MAP_FIXED, file, 0) == base)
             return base;
-        unmap(base);
+        munmap(base, capacity);
         return nullptr;
     }
     // `offset` and `byteCount` are multiples of `step`.
@@ -282,14 +279,8 @@ private:
         madvise(base + offset, byteCount, makeLargePages);
         return true;
     }
-    static void unmap(std::byte* base)
-    {
-        if (base)
-            munmap(base, capacity);
-    }
 #else
     static bool allocate(int, std::byte*, std::size_t, std::size_t) { return false; }
-    static void unmap(std::byte*) {}
 #endif
 
     std::byte* const base_;
