@@ -57,16 +57,12 @@ public:
     void took(double time)
     {
         switch (phase_) {
-        case Phase::WarmUp:
-            mode_ = !mode_;
-            if (++frames_ == 2)
-                begin(Phase::Turns);
-            break;
         case Phase::Turns:
-            times_[mode_].push_back(time);
+            if (frames_ >= 0)
+                times_[mode_].push_back(time);
             mode_ = !mode_;
             if (++frames_ == 2 * turns)
-                settle(median(times_[1]) < 0.95 * median(times_[0]));
+                settle(median(times_[1]) < 0.95 * median(times_[0]), firstInterval);
             break;
         case Phase::Settled: settled(time); break;
         case Phase::Probe:
@@ -78,9 +74,9 @@ public:
     }
 
 private:
-    enum class Phase { WarmUp, Turns, Settled, Probe };
-    static constexpr std::size_t turns = 4, probes = 2, remembered = 7, surprise = 3;
-    static constexpr std::size_t firstInterval = 32, longestInterval = 512;
+    enum class Phase { Turns, Settled, Probe };
+    static constexpr int turns = 4, probes = 2, firstInterval = 32, longestInterval = 512; // in frames
+    static constexpr std::size_t remembered = 7, surprise = 3;
 
     static double median(std::vector<double> times)
     {
@@ -92,14 +88,15 @@ private:
     void begin(Phase phase)
     {
         phase_ = phase;
-        frames_ = strange_ = 0;
+        frames_ = 0;
+        strange_ = 0;
     }
 
-    void settle(bool mode)
+    void settle(bool mode, int interval)
     {
         mode_ = mode;
         usual_ = median(times_[mode]);
-        interval_ = firstInterval;
+        interval_ = interval;
         begin(Phase::Settled);
     }
 
@@ -120,23 +117,21 @@ private:
 
     void probed()
     {
-        const double other = median(times_[mode_]), mine = median(times_[!mode_]);
-        if (other < 0.9 * mine) { // or so it seems: compare again
+        if (median(times_[mode_]) < 0.9 * median(times_[!mode_])) { // or so it seems: compare again
             times_ = {};
             begin(Phase::Turns);
-            return;
+        } else {
+            settle(!mode_, std::min(2 * interval_, longestInterval));
         }
-        mode_ = !mode_;
-        usual_ = mine;
-        interval_ = std::min(2 * interval_, longestInterval);
-        begin(Phase::Settled);
     }
 
-    Phase phase_ = Phase::WarmUp;
+    Phase phase_ = Phase::Turns;
     bool mode_ = false;
-    std::size_t frames_ = 0, interval_ = firstInterval, strange_ = 0; // frames in this phase
-    double usual_ = 0;                                                // the median time when it was last found out
-    std::array<std::vector<double>, 2> times_;                        // without, with
+    int frames_ = -2; // in this phase; below 0: the first frames of all, whose times do not count
+    int interval_ = firstInterval;
+    std::size_t strange_ = 0;                  // frames, one after the other, that took an unusual time
+    double usual_ = 0;                         // the median time when it was last found out
+    std::array<std::vector<double>, 2> times_; // without, with
 };
 
 // Compression: which messages of a rank are compressed in a frame. The pixels for one rank can be noise, those for
