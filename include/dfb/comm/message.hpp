@@ -139,11 +139,7 @@ struct MessageHeader {
 
     static MessageHeader of(MessageKind kind, std::uint32_t receiver = 0, std::int64_t number = 0)
     {
-        MessageHeader header;
-        header.kind = kind;
-        header.receiver = receiver;
-        header.number = number;
-        return header;
+        return {magicNumber, formatVersion, kind, receiver, number, 0, 0};
     }
 };
 static_assert(sizeof(MessageHeader) == 24 && std::is_trivially_copyable_v<MessageHeader>);
@@ -278,10 +274,7 @@ public:
     template <class T>
     T get()
     {
-        static_assert(std::is_trivially_copyable_v<T>);
-        T value;
-        std::memcpy(&value, take(sizeof value), sizeof value);
-        return value;
+        return loadAs<T>(take(sizeof(T)));
     }
     std::string getText()
     {
