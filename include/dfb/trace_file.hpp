@@ -13,7 +13,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
-#include <cstring>
 #include <exception>
 #include <fstream>
 #include <map>
@@ -287,9 +286,8 @@ private:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         std::vector<std::byte> bytes(sizeof dropped_ + records_.size() * sizeof(detail::TraceRecord));
-        std::memcpy(bytes.data(), &dropped_, sizeof dropped_);
-        if (!records_.empty())
-            std::memcpy(bytes.data() + sizeof dropped_, records_.data(), bytes.size() - sizeof dropped_);
+        const auto* records = reinterpret_cast<const std::byte*>(records_.data());
+        std::copy_n(records, bytes.size() - sizeof dropped_, detail::storeAll(bytes.data(), dropped_));
         dropped_ = 0;
         records_.clear();
         return bytes;
@@ -300,13 +298,11 @@ private:
         std::int64_t dropped = 0;
         std::vector<std::vector<detail::TraceRecord>> ranks;
         for (const std::vector<std::byte>& part : parts) {
-            const std::size_t bytes = part.size() - sizeof dropped;
-            if (part.size() < sizeof dropped || bytes % sizeof(detail::TraceRecord) != 0)
-                detail::failMalformed("a trace is not made of whole events");
-            dropped += detail::loadAs<std::int64_t>(part.data());
-            std::vector<detail::TraceRecord>& records = ranks.emplace_back(bytes / sizeof(detail::TraceRecord));
-            if (bytes > 0)
-                std::memcpy(records.data(), part.data() + sizeof dropped, bytes);
+            detail::ByteReader in(part.data(), part.size());
+            dropped += in.get<std::int64_t>();
+            std::vector<detail::TraceRecord>& records = ranks.emplace_back(in.left() / sizeof(detail::TraceRecord));
+            in.getBytes(reinterpret_cast<std::byte*>(records.data()), records.size() * sizeof(detail::TraceRecord));
+            in.end();
         }
         detail::TraceWriter(std::move(ranks)).write(out, dropped);
     }
