@@ -25,8 +25,6 @@ public:
 
     virtual ~Executor() = default;
     Executor() { tasks_.reserve(256); } // more tasks rarely wait at once
-    Executor(const Executor&) = delete;
-    Executor& operator=(const Executor&) = delete;
 
     // The number of workers, at least 1.
     virtual int concurrency() const noexcept = 0;
@@ -74,8 +72,7 @@ public:
     {
         if (count == 0)
             return;
-        std::exception_ptr error;
-        std::mutex errorMutex;
+        std::exception_ptr error; // of the body that has stopped the loop
         std::atomic<bool> stop{false};
         const auto guarded = [&](std::size_t i) {
             if (stop.load(std::memory_order_relaxed))
@@ -83,10 +80,8 @@ public:
             try {
                 body(i);
             } catch (...) {
-                std::lock_guard<std::mutex> lock(errorMutex);
-                if (!error)
+                if (!stop.exchange(true))
                     error = std::current_exception();
-                stop.store(true, std::memory_order_relaxed);
             }
             // Not within a task: otherwise tasks that contain loops would nest without a limit.
             while (depth() == 0 && help()) {
