@@ -73,8 +73,6 @@ public:
             throw TransportError(ranks_.reason(), failed);
         }
     }
-    MpiTransport(const MpiTransport&) = delete;
-    MpiTransport& operator=(const MpiTransport&) = delete;
     ~MpiTransport()
     {
         if (comm() != MPI_COMM_NULL && !detail::mpiSays(MPI_Finalized))

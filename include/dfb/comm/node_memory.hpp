@@ -162,8 +162,6 @@ public:
     static std::shared_ptr<NodeMemory> open(const Address&) { return nullptr; }
 #endif
 
-    NodeMemory(const NodeMemory&) = delete;
-    NodeMemory& operator=(const NodeMemory&) = delete;
     ~NodeMemory()
     {
 #if defined(MFD_CLOEXEC)
