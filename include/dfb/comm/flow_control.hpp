@@ -254,6 +254,7 @@ private:
         Outgoing out;
         Incoming in;
 
+        explicit Peer(std::uint64_t allowance) { reset(allowance); }
         void reset(std::uint64_t allowance)
         {
             out.queue.clear();
@@ -264,13 +265,7 @@ private:
         }
     };
 
-    Peer& peerOf(int rank)
-    {
-        const auto [place, isNew] = peers_.try_emplace(rank);
-        if (isNew)
-            place->second.reset(allowance_);
-        return place->second;
-    }
+    Peer& peerOf(int rank) { return peers_.try_emplace(rank, allowance_).first->second; }
 
     // Asks for the first message that waits, and for as many of the next as fit in a quarter of the pool with it.
     Request requestOf(Outgoing& out) const
