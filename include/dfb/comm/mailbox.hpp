@@ -690,12 +690,10 @@ private:
             inbox_.push({source, header, std::move(message)});
         }
         submit([](Mailbox& self) {
-            std::optional<Arrival> next;
-            {
-                const std::lock_guard<std::mutex> lock(self.mutex_);
-                next.emplace(self.inbox_.pop());
-            }
-            self.dispatch(std::move(*next));
+            std::unique_lock<std::mutex> lock(self.mutex_);
+            Arrival next = self.inbox_.pop();
+            lock.unlock();
+            self.dispatch(std::move(next));
         });
     }
 
