@@ -129,12 +129,8 @@ public:
     // each, and to these depths, which may be null if the image has none.
     void setStored(int x, int y, int count, const std::byte* stored, const float* depth)
     {
-        const std::size_t first = pixelAt(x, y), pixels = static_cast<std::size_t>(count);
-        overwrites(x, y, count);
-        if (float* out = detail::floatsOf(to_.at[detail::Depth]); out && depth)
-            std::copy(depth, depth + count, out + first);
-        if (std::byte* color = to_.at[detail::Color])
-            std::memcpy(color + first * bytesPerPixel(format_), stored, pixels * bytesPerPixel(format_));
+        if (std::byte* color = overwrite(x, y, count, depth))
+            std::memcpy(color, stored, static_cast<std::size_t>(count) * bytesPerPixel(format_));
     }
     // Sets pixels [x, x + count) of row y to the background, which is given as it is stored: bytesPerPixel(format())
     // bytes. Depth becomes +infinity. Pixels that are known to be background already are not written.
@@ -176,12 +172,18 @@ private:
                                  height());
     }
 
-    void overwrites(int x, int y, int count)
+    // Sets depths, unless they are null. Returns where the colours belong; null if they are not wanted.
+    std::byte* overwrite(int x, int y, int count, const float* depth = nullptr)
     {
         require(x, y, count);
         writtenPixels_ += count;
         if (background_)
             background_->remove(x, y, count);
+        const std::size_t first = pixelAt(x, y);
+        if (float* out = detail::floatsOf(to_.at[detail::Depth]); out && depth)
+            std::copy(depth, depth + count, out + first);
+        std::byte* color = to_.at[detail::Color];
+        return color ? color + first * bytesPerPixel(format_) : nullptr;
     }
 
     void writeBackground(int x, int y, int count, const std::byte* stored)
@@ -356,20 +358,16 @@ double FinishedTile::convert(const Real* rgba, int count, std::byte* color) cons
 template <class Real>
 double FinishedTile::setRow(int y, const Real* rgba, const float* depth, const AuxRow& aux)
 {
-    const std::size_t first = pixelAt(0, y);
-    overwrites(0, y, width());
     double farthest = 0;
-    if (std::byte* color = to_.at[detail::Color]) {
-        color += first * bytesPerPixel(format_);
+    if (std::byte* color = overwrite(0, y, width()))
         farthest = dither_ ? ditherPixels(rgba, width(), format_, region_.x0, region_.y0 + y, color)
                            : convert(rgba, width(), color);
-    }
     const auto set = [&](detail::Channel channel, const auto* from, auto empty) {
         if (!to_.at[channel])
             return;
         const std::size_t words = detail::channelWords[channel];
         const std::size_t count = words * static_cast<std::size_t>(width());
-        auto* out = reinterpret_cast<decltype(empty)*>(to_.at[channel]) + words * first;
+        auto* out = reinterpret_cast<decltype(empty)*>(to_.at[channel]) + words * pixelAt(0, y);
         if (from)
             std::copy(from, from + count, out);
         else
@@ -386,21 +384,15 @@ double FinishedTile::setRow(int y, const Real* rgba, const float* depth, const A
 
 DFB_COMPILED_ONCE double FinishedTile::setPixels(int x, int y, int count, const double* rgba, const float* depth)
 {
-    const std::size_t first = pixelAt(x, y);
-    overwrites(x, y, count);
-    if (float* out = detail::floatsOf(to_.at[detail::Depth]))
-        std::copy(depth, depth + count, out + first);
-    std::byte* color = to_.at[detail::Color];
-    return color ? convert(rgba, count, color + first * bytesPerPixel(format_)) : 0;
+    std::byte* color = overwrite(x, y, count, depth);
+    return color ? convert(rgba, count, color) : 0;
 }
 
 DFB_COMPILED_ONCE void FinishedTile::setPixels(int x, int y, int count, const float* rgba)
 {
-    overwrites(x, y, count);
-    std::byte* color = to_.at[detail::Color];
+    std::byte* color = overwrite(x, y, count);
     if (!color)
         return;
-    color += pixelAt(x, y) * bytesPerPixel(format_);
     if (format_ != OutputFormat::RGBA32F) {
         convertPixels(rgba, count, format_, color);
         return;
