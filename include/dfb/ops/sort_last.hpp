@@ -72,35 +72,22 @@ public:
         row_.resize(4 * width);
         for (std::size_t i = 0; i < row_.size(); ++i)
             row_[i] = rgba_[4 * first + i] / static_cast<double>(count);
-        AuxRow aux;
-        const auto weighted = [&](std::vector<float>& to, const std::vector<double>& from) -> const float* {
-            if (from.empty())
-                return nullptr;
-            to.resize(3 * width);
-            for (std::size_t i = 0; i < to.size(); ++i) {
-                const double weight = aux_.weight[first + i / 3];
-                to[i] = weight > 0 ? static_cast<float>(from[3 * first + i] / weight) : 0.0f;
-            }
-            return to.data();
+        // Fills `to` with values valueOf(from, i), `each` for each pixel. Null if the channel is not wanted.
+        const auto fill = [width](auto& to, const auto& from, std::size_t each, const auto& valueOf) {
+            to.resize(from.empty() ? 0 : each * width);
+            for (std::size_t i = 0; i < to.size(); ++i)
+                to[i] = valueOf(from, i);
+            return to.empty() ? nullptr : to.data();
         };
-        const auto ids = [&](std::vector<std::uint32_t>& to, const std::vector<FrontId>& from) -> const std::uint32_t* {
-            if (from.empty())
-                return nullptr;
-            to.resize(width);
-            for (std::size_t i = 0; i < width; ++i)
-                to[i] = from[first + i].id;
-            return to.data();
+        const auto mean = [&](const std::vector<double>& from, std::size_t i) {
+            const double weight = aux_.weight[first + i / 3];
+            return weight > 0 ? static_cast<float>(from[3 * first + i] / weight) : 0.0f;
         };
-        aux.normal = weighted(normal_, aux_.normal);
-        aux.albedo = weighted(albedo_, aux_.albedo);
-        if (!aux_.position.empty()) {
-            position_.resize(3 * width);
-            for (std::size_t i = 0; i < width; ++i)
-                std::copy_n(aux_.position[first + i].at, 3, position_.data() + 3 * i);
-            aux.position = position_.data();
-        }
-        aux.primitiveId = ids(primitiveId_, aux_.primitiveId);
-        aux.instanceId = ids(instanceId_, aux_.instanceId);
+        const auto positionAt = [first](const auto& from, std::size_t i) { return from[first + i / 3].at[i % 3]; };
+        const auto idAt = [first](const auto& from, std::size_t i) { return from[first + i].id; };
+        const AuxRow aux{fill(normal_, aux_.normal, 3, mean), fill(albedo_, aux_.albedo, 3, mean),
+                         fill(position_, aux_.position, 3, positionAt), fill(primitiveId_, aux_.primitiveId, 1, idAt),
+                         fill(instanceId_, aux_.instanceId, 1, idAt)};
         return out.setRow(y, row_.data(), depth_.data() + first, aux);
     }
 
