@@ -147,10 +147,8 @@ private:
     Scratch& start();
     void finishRuns(FinishedTile& out);
     void finishBytes(FinishedTile& out);
-    bool hasExactLevels(OutputFormat format) const;
     void finishLevels(FinishedTile& out);
     void roundExactly(FinishedTile& out, int y, double farthest);
-    const std::vector<DoubleDouble>& exactRow(int y);
     // All fragments, in the order of blending.
     void sort(std::vector<const Fragment*>& pointers) const;
     // Calls f(pass, begin, end) for each pass, with its fragments.
@@ -312,8 +310,8 @@ struct FragmentStore::Scratch {
     std::vector<std::uint8_t> isUndefined;
     NearestBytes nearest;
     std::vector<std::uint8_t> levels; // of a row
-    // For exactRow().
-    std::vector<DoubleDouble> exactMean;
+    // For roundExactly().
+    std::vector<DoubleDouble> exactSum;
     CompositeRow exactRow;
     FragmentCompositor exactCompositor;
 };
@@ -363,9 +361,12 @@ DFB_COMPILED_ONCE void FragmentStore::finish(FinishedTile& out)
         const bool isNearest = rule() == BlendRule::Nearest;
         const auto isOfBytes = [&](const Fragment& f) { return f.keepsBytes() && (f.hasDepth() || !isNearest); };
         const bool areOfBytes = std::all_of(fragments_.begin(), fragments_.end(), isOfBytes);
+        const bool hasExactLevels = rule() == BlendRule::InOrder && fragments_.size() <= 2
+                                    && (info_.wanted & depthChannel) == 0 && out.format() == OutputFormat::RGBA8
+                                    && info_.background == std::array<float, 4>{} && info_.minTransmittance == 0.0f;
         if (areOfBytes && isNearest)
             finishBytes(out);
-        else if (areOfBytes && hasExactLevels(out.format()))
+        else if (areOfBytes && hasExactLevels) // integers are enough
             finishLevels(out);
         else
             finishRuns(out);
@@ -511,14 +512,6 @@ DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
     }
 }
 
-// Whether integers are enough to blend inputs of 8 bits a channel.
-DFB_COMPILED_ONCE bool FragmentStore::hasExactLevels(OutputFormat format) const
-{
-    return rule() == BlendRule::InOrder && fragments_.size() <= 2 && (info_.wanted & depthChannel) == 0
-           && format == OutputFormat::RGBA8 && info_.background == std::array<float, 4>{}
-           && info_.minTransmittance == 0.0f;
-}
-
 // Blends up to two inputs of 8 bits a channel over an empty background to 8 bits. Integers are exact for that.
 DFB_COMPILED_ONCE void FragmentStore::finishLevels(FinishedTile& out)
 {
@@ -534,45 +527,34 @@ DFB_COMPILED_ONCE void FragmentStore::finishLevels(FinishedTile& out)
     }
 }
 
-// Rounds a row again where double does not tell which 8-bit level is nearer. `farthest`: the result of setRow() or
-// setPixels().
+// Rounds a row again, in twice the precision, where double does not tell which 8-bit level is nearer. `farthest`: the
+// result of setRow() or setPixels(). Call it after start().
 DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, double farthest)
 {
     // 3 roundings for each layer and pass.
     const double layers = static_cast<double>(fragments_.size()) + info_.passes;
     if (farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
         return;
-    const std::vector<DoubleDouble>& exact = exactRow(y);
-    const int step = out.isDithered() ? 4 : 1; // with dithering, only alpha is rounded again
-    for (int i = step - 1; i < 4 * out.width(); i += step) {
-        const DoubleDouble& value = exact[static_cast<std::size_t>(i)];
-        if (std::isfinite(value.high)) // twice the precision makes NaN of infinities
-            out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
-    }
-}
-
-// Returns row y in twice the precision, as the mean of the passes. Call it after start(). The result is valid until
-// this thread's next call.
-DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y)
-{
-    const int width = info_.region.width();
     Scratch& scratch = FragmentStore::scratch();
     CompositeRow& row = scratch.exactRow;
-    std::vector<DoubleDouble>& mean = scratch.exactMean;
-    mean.assign(4 * static_cast<std::size_t>(width), {});
+    std::vector<DoubleDouble>& sum = scratch.exactSum; // over the passes
+    sum.assign(4 * static_cast<std::size_t>(out.width()), {});
     row.minTransmittance = static_cast<double>(info_.minTransmittance);
     forEachPass(scratch.pointers, [&](std::size_t, auto begin, auto end) {
         scratch.exactCompositor.start(rule(), begin, end, false);
         scratch.exactCompositor.skipRows(y);
-        row.resize(width, 0, true);
+        row.resize(out.width(), 0, true);
         scratch.exactCompositor.nextRow(row);
-        overBackground(row, 0, width, info_.background.data());
-        for (std::size_t i = 0; i < mean.size(); ++i)
-            mean[i] = mean[i] + DoubleDouble{row.rgba[i], row.rgbaLow[i]};
+        overBackground(row, 0, out.width(), info_.background.data());
+        for (std::size_t i = 0; i < sum.size(); ++i)
+            sum[i] = sum[i] + DoubleDouble{row.rgba[i], row.rgbaLow[i]};
     });
-    for (DoubleDouble& value : mean)
-        value = value / info_.passes;
-    return mean;
+    const int step = out.isDithered() ? 4 : 1; // with dithering, only alpha is rounded again
+    for (int i = step - 1; i < 4 * out.width(); i += step) {
+        const DoubleDouble value = sum[static_cast<std::size_t>(i)] / info_.passes;
+        if (std::isfinite(value.high)) // twice the precision makes NaN of infinities
+            out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
+    }
 }
 
 } // namespace detail
