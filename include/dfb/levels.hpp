@@ -203,11 +203,13 @@ inline double toUnorm8(const float* values, int count, std::uint8_t* out) noexce
     return farthest;
 }
 
-// Converts the colours of `count` pixels to sRGB levels, and their alpha to linear ones. A colour that is near a
-// threshold counts as a tie.
-template <class Real>
-double toSrgb8(const Real* rgba, int count, std::uint8_t* out) noexcept
+// Converts `count` pixels to linear levels; or their colours to sRGB levels, where a colour that is near a threshold
+// counts as a tie, and their alpha to linear ones.
+template <bool IsSrgb, class Real>
+double toLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
 {
+    if constexpr (!IsSrgb)
+        return toUnorm8(rgba, 4 * count, out);
     constexpr int block = 64;
     const SrgbCells& cells = srgbCells();
     double farthest = 0;
@@ -230,16 +232,6 @@ double toSrgb8(const Real* rgba, int count, std::uint8_t* out) noexcept
         farthest = anyNear ? 0.5 : farthest;
     }
     return farthest;
-}
-
-// Converts `count` pixels to sRGB or linear levels.
-template <bool IsSrgb, class Real>
-double toLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
-{
-    if constexpr (IsSrgb)
-        return toSrgb8(rgba, count, out);
-    else
-        return toUnorm8(rgba, 4 * count, out);
 }
 
 #if defined(DFB_HAS_AVX2_CLONES)
