@@ -20,7 +20,7 @@ public:
             detail::failArgument("an image-parallel tile is of generation 0 and has no children, this one is of "
                                  "generation %d and has %d",
                                  fragment.header().generation, fragment.header().children);
-        this->store_.add(std::move(fragment));
+        detail::SortLast<BlendRule::InOrder, TileSize, Channels>::add(std::move(fragment));
     }
 };
 

@@ -100,21 +100,17 @@ private:
     std::vector<std::uint32_t> primitiveId_, instanceId_;
 };
 
-// Keeps the inputs of one tile until all of them are there. Then composites them pass by pass over the background, and
-// averages the passes, in double.
+// What the sort-last operations have in common: keeps the inputs of one tile until all of them are there. Then
+// composites them pass by pass over the background, and averages the passes, in double.
 class FragmentStore {
 public:
-    explicit FragmentStore(BlendRule rule) noexcept : rule_(rule) {}
-
-    // `channels`: of the operation.
-    void newFrame(const TileInfo& info, ChannelMask channels)
+    void newFrame(const TileInfo& info)
     {
         info_ = info;
-        tracked_ = static_cast<ChannelMask>((info.wanted & imageAuxChannels) | (channels & farChannel));
+        tracked_ = static_cast<ChannelMask>((info.wanted & imageAuxChannels) | (channels_ & farChannel));
         fragments_.clear();
         undefinedPixels_ = 0;
     }
-    const TileInfo& info() const noexcept { return info_; }
 
     void add(Fragment&& fragment)
     {
@@ -125,20 +121,23 @@ public:
         fragments_.push_back(std::move(fragment));
     }
 
-    // Forgets the inputs behind a generation.
-    void removeBehind(int generation);
-
-    // Called with (y, pass, row).
-    using PassDone = FunctionRef<void(int, int, const CompositeRow&)>;
-
-    // Calls passDone for each row and pass, row by row, with the background below.
-    void compositePasses(const PassDone& passDone);
-
     // Writes the mean of the passes.
     void finish(FinishedTile& out);
 
-    // The number of pixels in which inputs of the last finished frame overlapped in depth.
-    std::int64_t undefinedPixels() const noexcept { return undefinedPixels_; }
+    void report(TileReport& report) const { report.orderUndefinedPixels = undefinedPixels_; }
+
+    // For operations on top of this one: calls passDone(y, pass, row) for each row and pass, row by row, with the
+    // background below.
+    void compositePasses(const FunctionRef<void(int, int, const CompositeRow&)>& passDone);
+
+protected:
+    // `channels`: of the operation.
+    FragmentStore(BlendRule rule, ChannelMask channels) noexcept : rule_(rule), channels_(channels) {}
+
+    const TileInfo& info() const noexcept { return info_; }
+
+    // Forgets the inputs behind a generation.
+    void removeBehind(int generation);
 
 private:
     struct Scratch;
@@ -167,15 +166,16 @@ private:
     BlendRule rule() const noexcept { return info_.order ? BlendRule::InOrder : rule_; }
 
     BlendRule rule_; // if the frame has no order
+    ChannelMask channels_;
     TileInfo info_;
     ChannelMask tracked_ = 0;
     std::vector<Fragment> fragments_;
-    std::int64_t undefinedPixels_ = 0;
+    std::int64_t undefinedPixels_ = 0; // in which inputs overlapped in depth
 };
 
 // The base of the sort-last operations.
 template <BlendRule Rule, int TileSize, ChannelMask Channels>
-class SortLast {
+class SortLast : public FragmentStore {
 public:
     static constexpr int tileSize = TileSize;
     static constexpr ChannelMask channels = Channels;
@@ -184,16 +184,7 @@ public:
     static constexpr bool activeByDepth = Rule == BlendRule::Nearest;
     static constexpr bool readsInPlace = true;
 
-    void newFrame(const TileInfo& info) { store_.newFrame(info, Channels); }
-    void add(Fragment&& fragment) { store_.add(std::move(fragment)); }
-    void finish(FinishedTile& out) { store_.finish(out); }
-    void report(TileReport& report) const { report.orderUndefinedPixels = store_.undefinedPixels(); }
-
-    // For operations on top of this one: calls passDone(y, pass, row) for each composited row and pass, row by row.
-    void compositePasses(const FragmentStore::PassDone& passDone) { store_.compositePasses(passDone); }
-
-protected:
-    FragmentStore store_{Rule};
+    SortLast() noexcept : FragmentStore(Rule, Channels) {}
 };
 
 } // namespace detail
@@ -231,7 +222,7 @@ public:
 
     void newFrame(const TileInfo& info)
     {
-        detail::SortLast<BlendRule::InOrder, TileSize, Channels>::newFrame(info);
+        Base::newFrame(info);
         generations_.clear();
         opaque_ = none;
     }
@@ -242,7 +233,7 @@ public:
             detail::failArgument("inputs in order form a list: at most 1 child each, not %d",
                                  fragment.header().children);
         const int generation = fragment.header().generation;
-        const bool hides = opaqueHides(this->store_.info());
+        const bool hides = opaqueHides(Base::info());
         // If no input hides others, the dependency tracker reports this error at the end. Here it is checked early, as
         // the tile may be finished before that. Several declared inputs may be of generation 1: then generation 0 never
         // comes.
@@ -253,9 +244,9 @@ public:
             return;
         if (hides && fragment.isOpaque()) {
             opaque_ = generation;
-            this->store_.removeBehind(generation);
+            Base::removeBehind(generation);
         }
-        this->store_.add(std::move(fragment));
+        Base::add(std::move(fragment));
     }
 
     // Whether an opaque input and all inputs in front of it have come.
@@ -268,6 +259,8 @@ public:
     }
 
 private:
+    using Base = detail::SortLast<BlendRule::InOrder, TileSize, Channels>;
+
     bool has(int generation) const
     {
         return std::find(generations_.begin(), generations_.end(), generation) != generations_.end();
@@ -330,7 +323,7 @@ DFB_COMPILED_ONCE void FragmentStore::removeBehind(int generation)
                      fragments_.end());
 }
 
-DFB_COMPILED_ONCE void FragmentStore::compositePasses(const PassDone& passDone)
+DFB_COMPILED_ONCE void FragmentStore::compositePasses(const FunctionRef<void(int, int, const CompositeRow&)>& passDone)
 {
     Scratch& scratch = start();
     const std::size_t passes = static_cast<std::size_t>(info_.passes);
