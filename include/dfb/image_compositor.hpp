@@ -207,10 +207,7 @@ DFB_NAMESPACE_BEGIN
 namespace detail {
 
 // Blends inputs front to back by their source, which is the `place` of their rank.
-class BlendBySource : public SortLast<BlendRule::InOrder, 64, colorChannel | depthChannel> {
-public:
-    static constexpr ChannelMask neededChannels = colorChannel;
-};
+using BlendBySource = SortLast<BlendRule::InOrder, 64, colorChannel | depthChannel>;
 
 // On one node the tiles are strips, as wide as the picture (at most 4096 pixels). A strip is one piece of memory in
 // each image. Square tiles of as many pixels touch a page of memory for each of their rows, which takes up to 1.5 times

@@ -12,8 +12,6 @@ DFB_NAMESPACE_BEGIN
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicImageParallel : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:
-    static constexpr ChannelMask neededChannels = colorChannel;
-
     void add(Fragment&& fragment)
     {
         if (fragment.header().generation != 0 || fragment.header().children != 0)

@@ -179,6 +179,8 @@ class SortLast : public FragmentStore {
 public:
     static constexpr int tileSize = TileSize;
     static constexpr ChannelMask channels = Channels;
+    static constexpr ChannelMask neededChannels =
+        Rule == BlendRule::InOrder ? colorChannel : Channels & (colorChannel | depthChannel);
     static constexpr BlendRule rule = Rule;
     static constexpr bool emptyIsBackground = true;
     static constexpr bool activeByDepth = Rule == BlendRule::Nearest;
@@ -213,8 +215,6 @@ public:
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicOrderedBlend : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:
-    static constexpr ChannelMask neededChannels = colorChannel;
-
     static bool opaqueHides(const TileInfo& info)
     {
         return info.passes == 1 && (info.wanted & ~colorChannel) == 0 && (Channels & farChannel) == 0;
@@ -278,9 +278,6 @@ private:
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicDepthComposite : public detail::SortLast<BlendRule::Nearest, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: DepthComposite compares depths");
-
-public:
-    static constexpr ChannelMask neededChannels = Channels & (colorChannel | depthChannel);
 };
 
 using AlphaBlend = BasicAlphaBlend<>;
