@@ -157,12 +157,19 @@ public:
     {
         const int row = row_++;
         result.spanCount = 0;
-        if (isInPlace())
-            return readRow(row, result);
-        if (!findRow(row, result))
-            return false;
-        result.color = bytes_ ? decodeRow(result) : color_;
-        return true;
+        if (isInPlace()) {
+            detail::InputFaults faults;
+            parts_->inPlace.readRow(row, *rowPixels_, faults);
+            if (faults_)
+                faults_->add(faults);
+            result.spans = rowPixels_->active.spans.data();
+            result.spanCount = static_cast<int>(rowPixels_->active.spans.size());
+            result.color = rowPixels_->color.data();
+            result.depth = parts_->inPlace.depth ? rowPixels_->depth.data() : nullptr;
+        } else if (findRow(row, result)) {
+            result.color = bytes_ ? decodeRow(result) : color_;
+        }
+        return result.spanCount > 0;
     }
     // Like next(result), but sets bytes instead of colours. Only for a fragment that keepsBytes(). Pixels in place are
     // not checked, and some may be empty.
@@ -215,7 +222,14 @@ public:
         const std::size_t pixels = pixelsIn(row);
         if (parts_->encoding == FragmentEncoding::Sparse)
             span_ += row.spanCount;
-        advance(pixels);
+        if (bytes_)
+            bytes_ += 4 * pixels;
+        else
+            color_ += 4 * pixels;
+        if (depth_)
+            depth_ += pixels;
+        if (hasAux_)
+            aux_.advance(pixels);
     }
 
     // Skips `count` rows.
@@ -271,31 +285,6 @@ private:
         rowPixels_->color.resize(std::max(rowPixels_->color.size(), 4 * pixels));
         detail::bytesToFloats(bytes_, pixels, rowPixels_->color.data());
         return rowPixels_->color.data();
-    }
-
-    bool readRow(int y, FragmentRow& result)
-    {
-        detail::InputFaults faults;
-        parts_->inPlace.readRow(y, *rowPixels_, faults);
-        if (faults_)
-            faults_->add(faults);
-        result.spans = rowPixels_->active.spans.data();
-        result.spanCount = static_cast<int>(rowPixels_->active.spans.size());
-        result.color = rowPixels_->color.data();
-        result.depth = parts_->inPlace.depth ? rowPixels_->depth.data() : nullptr;
-        return result.spanCount > 0;
-    }
-
-    void advance(std::size_t pixels)
-    {
-        if (bytes_)
-            bytes_ += 4 * pixels;
-        else
-            color_ += 4 * pixels;
-        if (depth_)
-            depth_ += pixels;
-        if (hasAux_)
-            aux_.advance(pixels);
     }
 
     const Fragment::Parts* parts_;
