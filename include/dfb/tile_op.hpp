@@ -390,16 +390,8 @@ DFB_COMPILED_ONCE double FinishedTile::setPixels(int x, int y, int count, const 
 
 DFB_COMPILED_ONCE void FinishedTile::setPixels(int x, int y, int count, const float* rgba)
 {
-    std::byte* color = overwrite(x, y, count);
-    if (!color)
-        return;
-    if (format_ != OutputFormat::RGBA32F) {
-        convertPixels(rgba, count, format_, color);
-        return;
-    }
-    float* out = detail::floatsOf(color);
-    const int stored = isPastCache_ ? 4 * detail::streamPixels(rgba, count, out) : 0;
-    detail::fastest<detail::copyFloats>(rgba + stored, 4 * count - stored, out + stored);
+    if (std::byte* color = overwrite(x, y, count))
+        convert(rgba, count, color);
 }
 
 DFB_NAMESPACE_END
