@@ -23,6 +23,7 @@
 #include <cstdint>
 #include <exception>
 #include <memory>
+#include <mutex>
 #include <optional>
 #include <utility>
 #include <vector>
@@ -121,7 +122,11 @@ public:
         outcome_->newFrame(FrameTerms::of(params, rank()));
         inputsSent_ = 0;
         renderNs_ = -1;
-        figures_.newFrame();
+        {
+            const std::lock_guard<std::mutex> lock(figuresMutex_);
+            figures_.clear();
+            mergeErrors_.clear();
+        }
         lastPoll_ = beginTime_ = Clock::now();
         mailbox_->newEpoch(open_.next());
         mailbox_->connection().expectMessages(true);
@@ -183,12 +188,17 @@ public:
     void expectLayers(int layers) override { pipeline_->setLayers(layers); }
     TileSamples samples(int tile) const override { return pipeline_->table().samples(tile); }
 
-    void addFigure(std::uint64_t key, double value) override { figures_.add(key, value); }
+    void addFigure(std::uint64_t key, double value) override
+    {
+        const std::lock_guard<std::mutex> lock(figuresMutex_);
+        figures_.push_back({key, value});
+    }
     void noteMergeError(int tile, double bound) override
     {
         if (tile < 0 || tile >= layout().tileCount())
             failArgument("noteMergeError() for tile %d of an image of %d tiles", tile, layout().tileCount());
-        figures_.addMergeError(tile, bound / std::max(samples(tile).count, 1));
+        const std::lock_guard<std::mutex> lock(figuresMutex_);
+        mergeErrors_.push_back({static_cast<std::uint64_t>(tile), bound / std::max(samples(tile).count, 1)});
     }
 
     JobRange nextJobs(std::int64_t count) override
@@ -708,7 +718,9 @@ private:
         v.maxima[Verdict::RenderNs] = std::max<std::int64_t>(renderNs_, 0);
         v.maxima[Verdict::PeakInboxBytes] = static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes());
         v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
-        figures_.addTo(v);
+        const std::lock_guard<std::mutex> lock(figuresMutex_);
+        v.figures = Verdict::sortedSums(figures_);
+        v.mergeErrors = Verdict::sortedSums(mergeErrors_);
     }
 
     void polled() override
@@ -753,7 +765,8 @@ private:
     FrameConfig params_;
     Accumulation accumulation_;
     double mergeErrorBound_ = 0; // of this frame and those that it continues
-    FrameFigures figures_;
+    std::mutex figuresMutex_;
+    std::vector<Figure> figures_, mergeErrors_; // of this rank, by key and by tile; under figuresMutex_
     Compression compression_;
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
     std::atomic<std::int64_t> renderNs_{-1};  // from begin() until end(); -1: not there yet

@@ -345,7 +345,7 @@ public:
         const std::lock_guard<std::mutex> lock(reportsMutex_);
         verdict.sums.orderUndefinedPixels = orderUndefinedPixels_;
         verdict.wireErrorBound = wireErrorBound_;
-        verdict.tileErrors = FrameFigures::sums(errors_);
+        verdict.tileErrors = Verdict::sortedSums(errors_);
         for (const Promise& promise : promises_)
             if (!verdict.error && checksumOf(promise.tile) != promise.checksum) {
                 verdict.error = errorInfo(ErrorKind::InvalidArgument,

@@ -1,6 +1,6 @@
 // Verdict: the content of the reduction that ends each frame. It says whether any rank failed and which error all ranks
 // report, and has the figures of the frame that are sums or maxima over the ranks. FrameTerms: the parameters of the
-// frame that must be equal on all ranks. FrameFigures: the figures that a rank collects while the frame is open.
+// frame that must be equal on all ranks.
 #pragma once
 
 #include <dfb/comm/heartbeat.hpp>
@@ -17,7 +17,6 @@
 #include <cstring>
 #include <exception>
 #include <iterator>
-#include <mutex>
 #include <optional>
 #include <string>
 #include <tuple>
@@ -264,6 +263,16 @@ struct Verdict {
         all.resize(count);
         return all;
     }
+    // Sorts by key, then value, and adds up equal keys: so sums do not depend on the order in which threads added
+    // values.
+    static std::vector<Figure> sortedSums(std::vector<Figure> figures)
+    {
+        const auto isLess = [](double a, double b) { return std::isnan(b) ? !std::isnan(a) : a < b; }; // NaN is last
+        std::sort(figures.begin(), figures.end(), [&](const Figure& a, const Figure& b) {
+            return a.key != b.key ? a.key < b.key : isLess(a.value, b.value);
+        });
+        return summed(std::move(figures));
+    }
 
     // `what`: which parameters differ, or "" if that is not known.
     static ErrorInfo disagreement(const std::string& what = "")
@@ -344,53 +353,6 @@ struct Verdict {
         a.incomplete.insert(a.incomplete.end(), b.incomplete.begin(), b.incomplete.end()); // each tile has one owner
         return a.bytes();
     }
-};
-
-// Numbers of one rank that all ranks get to know with the verdict. All members may be called from any thread.
-class FrameFigures {
-public:
-    void newFrame()
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        figures_.clear();
-        mergeErrors_.clear();
-    }
-
-    // See Frame::addFigure().
-    void add(std::uint64_t key, double value)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        figures_.push_back({key, value});
-    }
-
-    // An input of that tile may be off by `bound`.
-    void addMergeError(int tile, double bound)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        mergeErrors_.push_back({static_cast<std::uint64_t>(tile), bound});
-    }
-
-    void addTo(Verdict& verdict) const
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        verdict.figures = sums(figures_);
-        verdict.mergeErrors = sums(mergeErrors_);
-    }
-
-    // Sorts by key, then value, and adds up equal keys: so sums do not depend on the order in which threads added
-    // values.
-    static std::vector<Figure> sums(std::vector<Figure> figures)
-    {
-        const auto isLess = [](double a, double b) { return std::isnan(b) ? !std::isnan(a) : a < b; }; // NaN is last
-        std::sort(figures.begin(), figures.end(), [&](const Figure& a, const Figure& b) {
-            return a.key != b.key ? a.key < b.key : isLess(a.value, b.value);
-        });
-        return Verdict::summed(std::move(figures));
-    }
-
-private:
-    mutable std::mutex mutex_;
-    std::vector<Figure> figures_, mergeErrors_; // by key, by tile
 };
 
 } // namespace detail
