@@ -54,10 +54,7 @@ public:
             } catch (const OutOfMemory& e) {
                 if (config_.framesInFlight == 1)
                     throw;
-                return Agreement{
-                    false,
-                    printed("%s; there is one for each of %d frames in flight", e.what(), config_.framesInFlight),
-                    rank()};
+                failArgument("%s; there is one for each of %d frames in flight", e.what(), config_.framesInFlight);
             }
             const Connection& network = mailbox_->connection();
             return Agreement::of(traits(), config_, network.config().checksums, {rank(), network.firstOnNode()},
@@ -387,31 +384,29 @@ private:
 
     // Adds the frame to the trace when it has ended, however it ends.
     struct EndOfFrame {
-        FrameEngine& engine;
+        const FrameEngine& engine;
         Clock::time_point time{}; // of the end; if not set, the time of destruction
 
         ~EndOfFrame()
         {
-            if (engine.config_.trace)
-                engine.traceFrame(time == Clock::time_point() ? Clock::now() : time);
+            if (!engine.config_.trace)
+                return;
+            const Clock::time_point begin = engine.beginTime_,
+                                    rendered = begin + std::chrono::nanoseconds(engine.renderNs_),
+                                    end = time == Clock::time_point() ? Clock::now() : time;
+            TraceEvent event;
+            event.frame = engine.open_.number();
+            const auto add = [&](TraceEvent::Kind kind, Clock::time_point from, Clock::time_point to) {
+                event.kind = kind;
+                event.begin = from;
+                event.end = to;
+                engine.config_.trace->add(event);
+            };
+            add(TraceEvent::Kind::Frame, begin, end);
+            add(TraceEvent::Kind::Render, begin, rendered);
+            add(TraceEvent::Kind::End, rendered, end);
         }
     };
-
-    void traceFrame(Clock::time_point end) const
-    {
-        TraceEvent event;
-        event.frame = open_.number();
-        const auto add = [&](TraceEvent::Kind kind, Clock::time_point from, Clock::time_point to) {
-            event.kind = kind;
-            event.begin = from;
-            event.end = to;
-            config_.trace->add(event);
-        };
-        const auto rendered = beginTime_ + std::chrono::nanoseconds(renderNs_);
-        add(TraceEvent::Kind::Frame, beginTime_, end);
-        add(TraceEvent::Kind::Render, beginTime_, rendered);
-        add(TraceEvent::Kind::End, rendered, end);
-    }
 
     // Lets messages of the frame in.
     void open(const std::exception_ptr& userError)
