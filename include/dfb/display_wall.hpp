@@ -59,14 +59,7 @@ public:
     const WallLayout& layout() const noexcept { return layout_; }
 
     // The configuration of a framebuffer of the wall's size, whose image goes to the wall only.
-    FrameBufferConfig frameBufferConfig() const
-    {
-        FrameBufferConfig config;
-        config.image.width = layout_.width();
-        config.image.height = layout_.height();
-        config.image.format = OutputFormat::None;
-        return config;
-    }
+    FrameBufferConfig frameBufferConfig() const { return {layout_.width(), layout_.height(), OutputFormat::None}; }
 
     // Waits until all displays have frame number `frame`: that is the moment to show it on all of them. Collective.
     // Call it once for each frame, after the frame has ended, in the order of the frames. A display's rank keeps parts
