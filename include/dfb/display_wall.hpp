@@ -9,6 +9,7 @@
 #include <dfb/pixel_op.hpp>
 #include <dfb/tile_layout.hpp>
 
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <memory>

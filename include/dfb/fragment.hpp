@@ -7,6 +7,7 @@
 #include <dfb/wire/active_pixels.hpp>
 #include <dfb/wire/wire_format.hpp>
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
