@@ -11,7 +11,6 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <type_traits>
 
 #if defined(__SSE2__)
 #include <immintrin.h>
@@ -319,15 +318,18 @@ double pixelsToLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
     return std::max(farthest, toLevels<IsSrgb>(rgba + 4 * done, count - done, out + 4 * done));
 }
 
-// A float -0 becomes 0, as in pixelOf().
 template <class Real>
 DFB_INLINE void toFloats(const Real* values, int count, float* out) noexcept
 {
     for (int i = 0; i < count; ++i)
-        if constexpr (std::is_same_v<Real, float>)
-            out[i] = values[i] + 0.0f;
-        else
-            out[i] = static_cast<float>(values[i]);
+        out[i] = static_cast<float>(values[i]);
+}
+
+// A float -0 becomes 0.
+DFB_INLINE void copyFloats(const float* values, int count, float* out) noexcept
+{
+    for (int i = 0; i < count; ++i)
+        out[i] = values[i] + 0.0f;
 }
 
 // A pixel as four floats; a float -0 becomes 0.

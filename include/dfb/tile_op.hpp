@@ -100,7 +100,8 @@ public:
     // in `format`. `background`: which of these pixels are known to be background; may be null.
     FinishedTile(const Region& region, OutputFormat format, const detail::Planes& to, std::size_t stride,
                  bool dither = false, detail::BackgroundPixels* background = nullptr)
-        : region_(region), format_(format), to_(to), stride_(stride), dither_(dither), background_(background)
+        : region_(region), format_(format), to_(to), stride_(stride), dither_(dither && bytesPerPixel(format) == 4),
+          background_(background)
     {
     }
 
@@ -115,8 +116,8 @@ public:
     bool wantsDepth() const noexcept { return to_.at[detail::Depth] != nullptr; }
 
     // Sets row y, in [0, height()): 4 * width() premultiplied linear values; if wantsDepth(), width() depths (null: all
-    // +infinity); and those auxiliary channels that the image has. Every row must be set once. Returns what
-    // convertPixels() or ditherPixels() returns.
+    // +infinity); and those auxiliary channels that the image has. Every row must be set once. Float colours of -0
+    // become 0. Returns what convertPixels() or ditherPixels() returns.
     template <class Real>
     double setRow(int y, const Real* rgba, const float* depth, const AuxRow& aux = {});
 
@@ -353,7 +354,14 @@ template <class Real>
 double FinishedTile::convert(const Real* rgba, int count, std::byte* color) const
 {
     const int stored = isPastCache_ ? detail::streamPixels(rgba, count, detail::floatsOf(color)) : 0;
-    return convertPixels(rgba + 4 * stored, count - stored, format_, color + 16 * stored);
+    rgba += 4 * stored;
+    color += 16 * stored;
+    if constexpr (std::is_same_v<Real, float>)
+        if (format_ == OutputFormat::RGBA32F) {
+            detail::fastest<detail::copyFloats>(rgba, 4 * (count - stored), detail::floatsOf(color));
+            return 0;
+        }
+    return convertPixels(rgba, count - stored, format_, color);
 }
 
 template <class Real>

@@ -184,10 +184,7 @@ int wrongPastCache(int first, int count)
     std::fill(std::begin(past), std::end(past), 7.0f);
     std::vector<Real> rgba;
     for (int i = 0; i < 4 * count; ++i)
-        rgba.push_back(static_cast<Real>(i % 5 == 0   ? 1e-40
-                                         : i % 7 == 0 ? 3e38
-                                         : i % 9 == 0 ? -0.0
-                                                      : 1.0 / 3 * (i % 11 - 5)));
+        rgba.push_back(static_cast<Real>(i % 5 == 0 ? 1e-40 : i % 7 == 0 ? 3e38 : 1.0 / 3 * (i % 11 - 5)));
     if (count > 20) {
         rgba[70] = std::numeric_limits<Real>::infinity();
         rgba[71] = std::numeric_limits<Real>::quiet_NaN();

@@ -94,8 +94,8 @@ private:
 
     void settle(bool mode, int interval)
     {
-        mode_ = mode;
         usual_ = median(times_[mode]);
+        mode_ = mode;
         interval_ = interval;
         begin(Phase::Settled);
     }

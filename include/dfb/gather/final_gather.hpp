@@ -362,7 +362,7 @@ public:
             return;
         const bool same = std::memcmp(&rgba, &background_, sizeof rgba) == 0;
         background_ = rgba;
-        std::vector<double> row;
+        std::vector<float> row;
         for (int tile = 0; tile < layout_.tileCount(); ++tile) {
             auto& s = state_[static_cast<std::size_t>(tile)];
             if (s == TileState::Received || (s == TileState::Background && same))
@@ -376,7 +376,7 @@ public:
             FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither);
             row.resize(4 * static_cast<std::size_t>(region.width()));
             for (std::size_t i = 0; i < row.size(); ++i)
-                row[i] = static_cast<double>(rgba[i % 4]);
+                row[i] = rgba[i % 4];
             for (int y = 0; y < region.height(); ++y)
                 out.setRow(y, row.data(), nullptr);
             s = TileState::Background;

@@ -12,6 +12,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <iterator>
 #include <limits>
 #include <memory>
 #include <random>
@@ -169,6 +170,22 @@ ByteOutput runBytes(const std::vector<ByteInput>& inputs, const dfb::TileInfo& i
     return out;
 }
 
+// Whether all colours of a row of floats become 0 if all are -0.
+bool hasNoSign(bool isPastCache, bool dither)
+{
+    namespace d = dfb::detail;
+    constexpr int width = 35;
+    alignas(64) static float image[4 * width];
+    std::fill(std::begin(image), std::end(image), 7.0f);
+    d::Planes planes;
+    planes.at[d::Color] = reinterpret_cast<std::byte*>(image);
+    dfb::FinishedTile finished({0, 0, width, 1}, dfb::OutputFormat::RGBA32F, planes, width, dither);
+    if (isPastCache)
+        finished.storePastCache();
+    finished.setRow(0, std::vector<float>(std::size_t{4} * width, -0.0f).data(), nullptr);
+    return std::all_of(std::begin(image), std::end(image), [](float v) { return v == 0 && !std::signbit(v); });
+}
+
 template <class Op>
 void checkBytes(std::uint64_t seed)
 {
@@ -197,6 +214,13 @@ void checkBytes(std::uint64_t seed)
 }
 
 } // namespace
+
+TEST_CASE("A row of floats becomes the same wherever it is stored: 0 for -0", "[tile_ops]")
+{
+    for (const bool isPastCache : {false, true})
+        for (const bool dither : {false, true})
+            CHECK(hasNoSign(isPastCache, dither));
+}
 
 TEST_CASE("AlphaBlend is within 1 ulp of exact in float, exact in 8 bits and in depth", "[ops]")
 {
