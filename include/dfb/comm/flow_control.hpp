@@ -283,7 +283,7 @@ private:
         return out.request = request;
     }
 
-    // What of `granted` is beyond the allowance and not consumed.
+    // The part of `granted` that is beyond the allowance and not consumed.
     std::uint64_t extraOf(const Incoming& in, std::uint64_t granted) const
     {
         const std::uint64_t covered = in.consumed + allowance_;

@@ -100,8 +100,8 @@ private:
     std::vector<std::uint32_t> primitiveId_, instanceId_;
 };
 
-// What the sort-last operations have in common: keeps the inputs of one tile until all of them are there. Then
-// composites them pass by pass over the background, and averages the passes, in double.
+// FragmentStore: the base of the sort-last operations. It keeps the inputs of one tile until all of them are there.
+// Then it composites them pass by pass over the background, and averages the passes, in double.
 class FragmentStore {
 public:
     void newFrame(const TileInfo& info)
