@@ -125,6 +125,7 @@ private:
 
 namespace detail {
 
+DFB_DETECTS(is_complete_v, sizeof(T));
 DFB_DETECTS(has_communicator_v,
             T(std::declval<const typename T::Communicator&>(), std::shared_ptr<MemoryPool>(), Progress()));
 DFB_DETECTS(has_rank_and_size_v, std::declval<const T&>().rank(), std::declval<const T&>().size());
@@ -166,15 +167,20 @@ namespace detail {
 template <class T>
 constexpr bool checkTransport()
 {
-    static_assert(has_communicator_v<T>, "dfb: Transport must provide a type Communicator and a constructor "
-                                         "(const Communicator&, std::shared_ptr<MemoryPool>, Progress)");
-    static_assert(has_rank_and_size_v<T>, "dfb: Transport must provide int rank() const and int size() const");
-    static_assert(has_send_v<T>, "dfb: Transport must provide void send(int destination, Buffer&&)");
-    static_assert(has_poll_v<T>, "dfb: Transport must provide bool poll(), bool needsPolling() const, "
-                                 "bool mayPoll() const and bool quiet() const");
-    static_assert(has_nap_v<T>, "dfb: Transport must provide void nap(std::chrono::nanoseconds) and void interrupt()");
-    static_assert(has_start_and_stop_v<T>,
-                  "dfb: Transport must provide void start(TransportHandler&) and void stop(bool orderly)");
+    static_assert(is_complete_v<T>, "dfb: this Transport is only declared. For MpiTransport, compile with mpicxx, or "
+                                    "link the CMake target dfb::mpi");
+    if constexpr (is_complete_v<T>) { // else one message is enough
+        static_assert(has_communicator_v<T>, "dfb: Transport must provide a type Communicator and a constructor "
+                                             "(const Communicator&, std::shared_ptr<MemoryPool>, Progress)");
+        static_assert(has_rank_and_size_v<T>, "dfb: Transport must provide int rank() const and int size() const");
+        static_assert(has_send_v<T>, "dfb: Transport must provide void send(int destination, Buffer&&)");
+        static_assert(has_poll_v<T>, "dfb: Transport must provide bool poll(), bool needsPolling() const, "
+                                     "bool mayPoll() const and bool quiet() const");
+        static_assert(has_nap_v<T>,
+                      "dfb: Transport must provide void nap(std::chrono::nanoseconds) and void interrupt()");
+        static_assert(has_start_and_stop_v<T>,
+                      "dfb: Transport must provide void start(TransportHandler&) and void stop(bool orderly)");
+    }
     return is_transport_v<T>;
 }
 

@@ -1,6 +1,9 @@
 // An archetype, which has only what a transport must have. Each case leaves out one part.
 #include <dfb/dfb.hpp>
 
+#if defined(CASE_NO_MPI) // expect: dfb: this Transport is only declared. For MpiTransport, compile with mpicxx
+using Transport = dfb::MpiTransport;
+#else
 struct Transport {
 #if defined(CASE_NO_COMMUNICATOR) // expect: dfb: Transport must provide a type Communicator and a constructor
     Transport(int, std::shared_ptr<dfb::MemoryPool>, dfb::Progress);
@@ -43,5 +46,6 @@ struct Transport {
     bool poll();
 #endif
 };
+#endif
 
 template class dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, Transport>;
