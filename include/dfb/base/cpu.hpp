@@ -1,5 +1,5 @@
 // Cpu: compiles loops a second time for processors with AVX2 and F16C, the conversion of half floats, and picks at run
-// time. FMA is not used, so that the results are the same, bit for bit.
+// time. FMA is not used, so that the results are the same, bit for bit. One loop also exists for AVX-512.
 //
 //   DFB_INLINE void body(...) { ... }
 //   fastest<body>(...);
@@ -18,8 +18,10 @@
 #define DFB_HAS_AVX2_CLONES 1
 #if defined(__clang__)
 #define DFB_AVX2 __attribute__((target("avx2,f16c")))
+#define DFB_AVX512 __attribute__((target("avx2,f16c,avx512f")))
 #else // GCC 12 vectorizes few loops at -O2
 #define DFB_AVX2 __attribute__((target("avx2,f16c"), optimize("O3")))
+#define DFB_AVX512 __attribute__((target("avx2,f16c,avx512f"), optimize("O3")))
 #endif
 #define DFB_INLINE inline __attribute__((always_inline))
 // Calls one of two functions with the same arguments: the second one if cpuHasAvx2(). On other architectures the second
@@ -48,6 +50,17 @@ inline bool cpuHasAvx2() noexcept
         unsigned a = 0, b = 0, c = 0, d = 0; // Clang 14 knows no name for F16C
         return __builtin_cpu_supports("avx2") != 0 && __get_cpuid(1, &a, &b, &c, &d) != 0 && (c & bit_F16C) != 0;
     }();
+    return has;
+#else
+    return false;
+#endif
+}
+
+// Whether the processor has AVX-512 and is of a kind that does not lower its clock for it: those that do lack VBMI2.
+inline bool cpuHasAvx512() noexcept
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    static const bool has = cpuHasAvx2() && __builtin_cpu_supports("avx512vbmi2") != 0;
     return has;
 #else
     return false;

@@ -171,7 +171,7 @@ private:
         return true;
     }
 
-    // Blends rows_, with AVX2. Returns false if `row` is undefined afterwards.
+    // Blends rows_, with AVX2 or AVX-512. Returns false if `row` is undefined afterwards.
     template <bool HasLeast>
     bool blendInPlace([[maybe_unused]] CompositeRow& row)
     {
@@ -184,8 +184,9 @@ private:
         if (isFull_ && haveOneOrder(count, isTold)) {
             for (std::size_t k = 0; k < order_.size(); ++k)
                 ordered_[k] = rows_[static_cast<std::size_t>(order_[k])];
-            if (detail::blendFullRowsAvx2<HasLeast>(ordered_.data(), layers, row.minTransmittance, rgba,
-                                                    transmittance)) {
+            const auto blend =
+                detail::cpuHasAvx512() ? detail::blendFullRowsAvx512<HasLeast> : detail::blendFullRowsAvx2<HasLeast>;
+            if (blend(ordered_.data(), layers, row.minTransmittance, rgba, transmittance)) {
                 joinRun(x, count);
                 return true;
             }

@@ -1,6 +1,6 @@
 // The kernels for rows in place: if all inputs of a tile have the same bounds, they are blended as they are read. They
-// exist for AVX2 alone. Without it, such rows are searched, copied and blended like others, with the same bits as the
-// result.
+// exist for AVX2 alone, and that for full rows for AVX-512. Without AVX2, such rows are searched, copied and blended
+// like others, with the same bits as the result.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -32,6 +32,20 @@ DFB_AVX2 DFB_INLINE bool read(const RowInPlace& row, std::ptrdiff_t pixel, Avx2C
     return _mm256_testz_si256(_mm256_castps_si256(_mm256_or_ps(ab, cd)), withoutSign) == 0;
 }
 
+// Calls blend(pixel, first, last) to blend rows [first, last) at four pixels, under the rows before, until all rows are
+// blended at all pixels of a row of 4 or more.
+template <class Blend>
+DFB_INLINE void forEachFour(std::ptrdiff_t width, int layers, const Blend& blend)
+{
+    const std::ptrdiff_t inFours = width - width % 4;
+    for (std::ptrdiff_t begin = 0; begin < inFours; begin += 256)
+        for (int first = 0; first < layers; first += rowsAtOnce)
+            for (std::ptrdiff_t i = begin; i < std::min(begin + 256, inFours); i += 4)
+                blend(i, first, std::min(first + rowsAtOnce, layers));
+    if (inFours < width)
+        blend(width - 4, 0, layers); // overlaps those before
+}
+
 // Blends rows of 4 pixels or more, the front one first, with the same result as blendGroup(). Returns false if the
 // result is not to be used: a value is not finite, an alpha is not within [0, 1], or four neighbours are empty in all
 // rows.
@@ -39,12 +53,10 @@ template <bool HasLeast>
 DFB_AVX2 bool blendFullRowsAvx2(const RowInPlace* rows, int layers, double minTransmittance, double* rgba,
                                 double* transmittance)
 {
-    const std::ptrdiff_t width = rows->span.count, inFours = width - width % 4;
     Avx2ColorCheck check;
     check.clear();
     bool hasGap = false;
-    // Blends rows [first, last) at four pixels, under the rows before.
-    const auto blend = [&](std::ptrdiff_t pixel, int first, int last) DFB_AVX2 {
+    forEachFour(rows->span.count, layers, [&](std::ptrdiff_t pixel, int first, int last) DFB_AVX2 {
         Avx2Colors colors;
         Avx2Block<HasLeast> block;
         if (first == 0) {
@@ -59,13 +71,71 @@ DFB_AVX2 bool blendFullRowsAvx2(const RowInPlace* rows, int layers, double minTr
         }
         block.store(rgba + 4 * pixel, transmittance + pixel);
         hasGap |= last == layers && block.isEmpty();
-    };
-    for (std::ptrdiff_t begin = 0; begin < inFours; begin += 256)
-        for (int first = 0; first < layers; first += rowsAtOnce)
-            for (std::ptrdiff_t i = begin; i < std::min(begin + 256, inFours); i += 4)
-                blend(i, first, std::min(first + rowsAtOnce, layers));
-    if (inFours < width)
-        blend(width - 4, 0, layers); // overlaps those before
+    });
+    return !hasGap && check.isGood();
+}
+
+// Two pixels in a register, and the transmittance of each, four times, in another. Instructions that zero what a mask
+// leaves out are used, although it leaves out nothing: of the others GCC 12 says that they read what is uninitialized.
+template <bool HasLeast>
+struct Avx512Pair {
+    __m512d sum, through;
+
+    DFB_AVX512 DFB_INLINE void clear() { sum = _mm512_setzero_pd(), through = _mm512_set1_pd(1.0); }
+    DFB_AVX512 DFB_INLINE void load(const double* rgba, const double* transmittance)
+    {
+        const double a = transmittance[0], b = transmittance[1];
+        sum = _mm512_loadu_pd(rgba);
+        through = _mm512_setr_pd(a, a, a, a, b, b, b, b);
+    }
+    DFB_AVX512 DFB_INLINE void add(__m128 first, __m128 second, double minTransmittance)
+    {
+        constexpr int nearest = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC; // no compiler fuses such a product
+        const __m512d v = _mm512_maskz_cvtps_pd(0xff, _mm256_set_m128(second, first));
+        const __m512d alphas = _mm512_maskz_permutex_pd(0xff, v, 0xff);
+        sum = _mm512_add_pd(sum, _mm512_maskz_mul_round_pd(0xff, through, v, nearest));
+        through = _mm512_mul_pd(through, _mm512_sub_pd(_mm512_set1_pd(1.0), alphas));
+        if constexpr (HasLeast) { // values below it become 0, a NaN stays
+            const __mmask8 stays = _mm512_cmp_pd_mask(through, _mm512_set1_pd(minTransmittance), _CMP_NLT_UQ);
+            through = _mm512_maskz_mov_pd(stays, through);
+        }
+    }
+    DFB_AVX512 DFB_INLINE void store(double* rgba, double* transmittance) const
+    {
+        _mm512_storeu_pd(rgba, sum);
+        transmittance[0] = through[0], transmittance[1] = through[4];
+    }
+    DFB_AVX512 DFB_INLINE bool isEmpty() const // -0 counts as 0
+    {
+        return _mm512_test_epi64_mask(_mm512_castpd_si512(sum), _mm512_set1_epi64(0x7fffffffffffffff)) == 0;
+    }
+};
+
+// As blendFullRowsAvx2(), with the same bits.
+template <bool HasLeast>
+DFB_AVX512 bool blendFullRowsAvx512(const RowInPlace* rows, int layers, double minTransmittance, double* rgba,
+                                    double* transmittance)
+{
+    Avx2ColorCheck check;
+    check.clear();
+    bool hasGap = false;
+    forEachFour(rows->span.count, layers, [&](std::ptrdiff_t pixel, int first, int last) DFB_AVX512 {
+        Avx512Pair<HasLeast> ab, cd;
+        if (first == 0) {
+            ab.clear(), cd.clear();
+        } else {
+            ab.load(rgba + 4 * pixel, transmittance + pixel);
+            cd.load(rgba + 4 * pixel + 8, transmittance + pixel + 2);
+        }
+        for (int k = first; k < last; ++k) {
+            Avx2Colors colors;
+            read(rows[k], pixel, colors, check);
+            ab.add(colors.a, colors.b, minTransmittance), cd.add(colors.c, colors.d, minTransmittance);
+        }
+        ab.store(rgba + 4 * pixel, transmittance + pixel);
+        cd.store(rgba + 4 * pixel + 8, transmittance + pixel + 2);
+        hasGap |= last == layers && ab.isEmpty() && cd.isEmpty();
+    });
     return !hasGap && check.isGood();
 }
 

@@ -3,6 +3,7 @@
 #include "catch.hpp"
 
 #include <dfb/blend/compositing.hpp>
+#include <dfb/blend/in_place_kernels.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/adversarial.hpp>
 
@@ -119,6 +120,60 @@ TEST_CASE("Blending a group of layers by hand gives the bits of plain C++", "[ke
     }
     CHECK(different == 0);
 }
+
+#if defined(DFB_HAS_AVX2_CLONES)
+TEST_CASE("Full rows in place: with AVX2 and AVX-512 as in plain C++", "[kernels]")
+{
+    Random random(11);
+    int different = 0, used = 0;
+    for (int round = 0; d::cpuHasAvx2() && round < 4000; ++round) {
+        const int width = 3 + anyCount(random) + (round % 50 == 0 ? 256 : 0);
+        const Stack stack(random, kinds[round % 4], 1 + static_cast<int>(below(random, d::mostInPlace)), width);
+        if (round % 3 == 0) // four empty pixels
+            for (const dfb::Layer& layer : stack.layers)
+                std::fill_n(const_cast<float*>(layer.color), 16, below(random, 2) ? 0.0f : -0.0f);
+        std::vector<d::RowInPlace> rows;
+        bool isGood = true;
+        for (const dfb::Layer& layer : stack.layers) {
+            d::RowInPlace& row = rows.emplace_back();
+            row.span = {0, static_cast<std::uint16_t>(width)};
+            row.color = row.colorAhead = layer.color;
+            for (int i = 0; i < width; ++i) {
+                const float* pixel = layer.color + 4 * i;
+                isGood = isGood && std::all_of(pixel, pixel + 4, [](float c) { return std::isfinite(c); })
+                         && pixel[3] >= 0 && pixel[3] <= 1;
+            }
+        }
+        const double least = anyLeast(random);
+        const auto size = static_cast<std::size_t>(width);
+        std::vector<double> plain(4 * size), transmittance(size);
+        d::BlendGroup group;
+        group.minTransmittance = least;
+        for (std::size_t k = 0; k < stack.layers.size(); k += 8, group.isFirst = false) {
+            group.layers = static_cast<int>(std::min<std::size_t>(8, stack.layers.size() - k));
+            for (int j = 0; j < group.layers; ++j)
+                group.colors[j] = stack.layers[k + static_cast<std::size_t>(j)].color;
+            (least > 0 ? d::blendGroupPlain<true> : d::blendGroupPlain<false>)(plain.data(), transmittance.data(),
+                                                                               width, group);
+        }
+        for (int i = 0; i < width; i += 4) { // the last four overlap those before
+            const auto four = plain.begin() + 4 * std::min(i, width - 4);
+            isGood = isGood && std::any_of(four, four + 16, [](double c) { return c != 0; });
+        }
+        const auto check = [&](auto blend) {
+            std::vector<double> rgba(4 * size, -1.0), through(size, -1.0);
+            const bool isUsed = blend(rows.data(), static_cast<int>(rows.size()), least, rgba.data(), through.data());
+            different += isUsed != isGood || (isUsed && (!isSame(rgba, plain) || !isSame(through, transmittance)));
+            used += isUsed;
+        };
+        check(least > 0 ? d::blendFullRowsAvx2<true> : d::blendFullRowsAvx2<false>);
+        if (d::cpuHasAvx512())
+            check(least > 0 ? d::blendFullRowsAvx512<true> : d::blendFullRowsAvx512<false>);
+    }
+    CHECK(different == 0);
+    CHECK((used > 1000 || !d::cpuHasAvx2()));
+}
+#endif
 
 TEST_CASE("A constant under pixels, and the nearest depths: by hand as in plain C++", "[kernels]")
 {
