@@ -7,6 +7,7 @@
 // all alike.
 #include "figures.hpp"
 
+#include <dfb/blend/in_place_kernels.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/wire/fragment_message.hpp>
 
@@ -310,6 +311,54 @@ void measureBlending()
     measureSorted<64>(16, Depths::Random, 0.3);
     measureSorted<128>(16, Depths::Random, 0.3);
 }
+
+#if defined(DFB_HAS_AVX2_CLONES)
+// Rows of whole images of 1024 x 1024 are blended where they lie, tile by tile.
+void measureInPlace(int count, const char* instructions, decltype(&dfb::detail::blendFullRowsAvx2<false>) blend)
+{
+    constexpr std::size_t side = 64, width = 1024, tiles = (width / side) * (width / side);
+    Kernel kernel;
+    kernel.name = "in place, " + std::to_string(count) + " x 64², " + instructions + ", from memory";
+    kernel.bytes = 16.0 * side * side * count;
+    kernel.against = "in place, " + std::to_string(count) + " x 64², AVX2, from memory";
+    kernel.measure = Kernel::Measure::Time;
+    measure(kernel, [=]() -> Function {
+        std::vector<float> image(4 * width * width);
+        Random random(5);
+        fillColor(image.data(), width * width, 0.2f, random);
+        const auto images =
+            std::make_shared<std::vector<std::vector<float>>>(static_cast<std::size_t>(count), std::move(image));
+        return [=, next = std::size_t{0}](benchmark::State& s) mutable {
+            std::vector<double> rgba(4 * side), transmittance(side);
+            std::vector<dfb::detail::RowInPlace> rows(images->size());
+            for (auto _ : s) {
+                const std::size_t x = next % (width / side) * side, y = next / (width / side) * side;
+                for (std::size_t row = y; row < y + side; ++row) {
+                    for (std::size_t k = 0; k < rows.size(); ++k) {
+                        const float* const pixels = (*images)[k].data() + 4 * x;
+                        rows[k].span = {0, side};
+                        rows[k].color = pixels + 4 * width * row;
+                        rows[k].colorAhead = pixels + 4 * width * std::min(row + 1, y + side - 1);
+                    }
+                    benchmark::DoNotOptimize(blend(rows.data(), count, 0, rgba.data(), transmittance.data()));
+                    benchmark::ClobberMemory();
+                }
+                next = (next + 1) % tiles;
+            }
+        };
+    });
+}
+
+void measureInPlace()
+{
+    for (const int count : {2, 4, 8, 16}) {
+        if (dfb::detail::cpuHasAvx2())
+            measureInPlace(count, "AVX2", dfb::detail::blendFullRowsAvx2<false>);
+        if (dfb::detail::cpuHasAvx512())
+            measureInPlace(count, "AVX-512", dfb::detail::blendFullRowsAvx512<false>);
+    }
+}
+#endif
 
 // ---- conversion
 
@@ -654,6 +703,9 @@ int main(int argc, char** argv)
         return 2;
     try {
         measureBlending();
+#if defined(DFB_HAS_AVX2_CLONES)
+        measureInPlace();
+#endif
         measureConversions();
         measureWire();
         Reporter reporter;
