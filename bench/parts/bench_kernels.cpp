@@ -318,9 +318,10 @@ void measureInPlace(int count, const char* instructions, decltype(&dfb::detail::
 {
     constexpr std::size_t side = 64, width = 1024, tiles = (width / side) * (width / side);
     Kernel kernel;
-    kernel.name = "in place, " + std::to_string(count) + " x 64², " + instructions + ", from memory";
+    const std::string inputs = "in place, " + std::to_string(count) + " x 64², ", avx2 = inputs + "AVX2, from memory";
+    kernel.name = inputs + instructions + ", from memory";
     kernel.bytes = 16.0 * side * side * count;
-    kernel.against = "in place, " + std::to_string(count) + " x 64², AVX2, from memory";
+    kernel.against = kernel.name == avx2 ? "" : avx2;
     kernel.measure = Kernel::Measure::Time;
     measure(kernel, [=]() -> Function {
         std::vector<float> image(4 * width * width);

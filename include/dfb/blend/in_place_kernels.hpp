@@ -111,7 +111,8 @@ struct Avx512Pair {
     }
 };
 
-// As blendFullRowsAvx2(), with the same bits.
+// As blendFullRowsAvx2(), with the same bits. The two share no template, as that could not be inlined into functions
+// that allow different instructions.
 template <bool HasLeast>
 DFB_AVX512 bool blendFullRowsAvx512(const RowInPlace* rows, int layers, double minTransmittance, double* rgba,
                                     double* transmittance)
