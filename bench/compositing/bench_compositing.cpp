@@ -107,7 +107,8 @@ class MemoryNeeds {
 public:
     explicit MemoryNeeds(const Inputs& inputs)
         : image_(static_cast<double>(inputs.image().depth.size())),
-          all_(image_ * static_cast<double>(inputs.viewports().size()))
+          all_(image_ * static_cast<double>(inputs.viewports().size())),
+          views_(static_cast<double>(inputs.views.size()))
     {
         for (const auto& v : inputs.viewports())
             used_ += static_cast<double>(v[2]) * v[3];
@@ -120,8 +121,9 @@ public:
         for (const System& s : systems) {
             const auto has = [&](const char* text) { return s.config.find(text) != std::string::npos; };
             hasDfb = hasDfb || s.name == "dfb";
+            sum += s.copied * views_ * all_;
             if (s.name == "limit")
-                sum += 16 * image_;
+                sum += 16 * image_ * views_;
             else if (s.name == "dfb")
                 sum += 4 * used_ + 16 * image_;
             else if (s.name == "plain")
@@ -133,7 +135,7 @@ public:
     }
 
 private:
-    double image_, all_, used_ = 0; // pixels of the image, of all ranks' images, and of their viewports
+    double image_, all_, views_, used_ = 0; // pixels of the image, of all ranks' images, and of their viewports; views
 };
 
 // In bytes; as good as infinite where the system does not say.

@@ -87,6 +87,7 @@ struct System {
     std::string name, config, output;  // output: of the image, "float" or "8 bit"
     std::function<Compositor()> start; // collective, as is the end of what it returns
     bool isDefault = false;
+    int copied = 0; // bytes a pixel of each view that it keeps beside the view
     Compositor compositor{};
     std::vector<double> ms{}, cpuMs{}, yieldMs{};
     Result result{};
@@ -222,6 +223,7 @@ void addToBoth(std::vector<System>& systems, const char* name, const std::string
         s.config = config;
         s.output = toBytes ? "8 bit" : "float";
         s.isDefault = settings.isDefault;
+        s.copied = settings.hasBytes ? 8 : settings.isShared ? 20 : 0;
         s.start = [start, toBytes] { return start(toBytes); };
         systems.push_back(std::move(s));
     }
@@ -422,6 +424,7 @@ inline void addIceT(std::vector<System>& systems, const Inputs& inputs)
                                                     : "float, ")
                        + name;
             s.output = way == Way::Floats ? "float" : "8 bit";
+            s.copied = way == Way::Floats ? 0 : 4;
             s.start = [settings, way, hasBytes, convert, &inputs] {
                 const PartialImage& first = inputs.image();
                 const auto icet = std::make_shared<IceT>(inputs.comm, settings, first.width, first.height);
