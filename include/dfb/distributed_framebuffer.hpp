@@ -24,8 +24,9 @@
 DFB_NAMESPACE_BEGIN
 
 // One object per rank. Construction and destruction are collective over the communicator. One thread at a time may call
-// the constructor, begin(), end() and the collective members. On a thread that may not call MPI (see Progress) all of
-// these throw InvalidArgument, on this rank alone; a constructor that is given a communicator throws TransportError.
+// the constructor, begin(), end(), isDone() and the collective members. On a thread that may not call MPI (see
+// Progress) these throw InvalidArgument, on this rank alone; a constructor that gets a communicator throws
+// TransportError.
 template <class TileOp, class PixelOp, class Transport>
 class DistributedFrameBuffer {
     static_assert(detail::checkTileOp<TileOp>());
@@ -46,7 +47,7 @@ public:
     using PixelFrameData = typename Operations::PixelFrameData;
 
     // A frame that has begun. If it is destroyed without end(), the frame fails on all ranks (after isDone() it may
-    // also end well), and the destructor waits until all ranks have ended it.
+    // also end well), and the destructor waits until all ranks know that.
     class [[nodiscard]] Frame {
     public:
         Frame(Frame&&) noexcept = default;
@@ -60,9 +61,10 @@ public:
         int tileOwner(int tile) const noexcept { return engine_->ownerNow(tile); }
         const std::vector<int>& ownedTiles() const noexcept { return engine_->ownedNow(); }
 
-        // Prepares `tile` for a tile and a pass of this frame: clears all pixels, and sets generation 0, no children,
-        // this rank as source, and part 0. Any thread. Waits for nothing. Throws InvalidArgument for an index or a pass
-        // that the frame does not have.
+        // Prepares `tile` for a tile and a pass of this frame: clears it, and sets generation 0, no children, this rank
+        // as source, and part 0. A channel that is not sent in this frame is not cleared, such as depth that neither
+        // the operation nor the image needs. Any thread. Waits for nothing. Throws InvalidArgument for an index or a
+        // pass that the frame does not have.
         void start(Tile& tile, int tileIndex, int pass = 0) const
         {
             static_cast<TileHeader&>(tile) = engine_->headerOf(tileIndex, pass);
@@ -81,25 +83,25 @@ public:
         // only while more than messages.poolBytes are under way from this rank, and runs tasks of the executor
         // meanwhile; a thread that may not call MPI does not wait. Throws InvalidArgument, with nothing sent, for a
         // tile of another frame, for an index, region or pass that the frame does not have, for a generation that is
-        // not 0 to 65535, and for a negative number of children. Throws OutOfMemory. An input that contradicts others
-        // (too many, sent twice, not announced) makes the frame fail: end() throws.
+        // not 0 to 65535, and for a negative number of children. Throws OutOfMemory, and what the codec throws. An
+        // input that contradicts others (too many, sent twice, not announced) makes the frame fail: end() throws.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
         // Sends pixels that lie in your own memory. They are not read after setTile() has returned, unless you promise
         // TileView::staysUntilEnd. Threads, waiting and exceptions as above. Also throws InvalidArgument if a channel
-        // that must be sent is null.
+        // that must be sent is null, or if rows overlap.
         void setTile(const TileView& tile) { engine_->setTile(tile); }
 
-        // True if this rank knows of an opaque input of that tile in a lower generation: an input of this generation
-        // cannot be seen then, and need not be rendered. Always false unless the operation has opaqueHides(). setTile()
-        // drops hidden inputs. Any thread. Waits for nothing. Nobody checks the index.
+        // True if this rank was told, by hide(), that inputs of this generation cannot be seen: they need not be
+        // rendered, and setTile() drops them. Always false unless the operation has opaqueHides(). Any thread. Waits
+        // for nothing. Nobody checks the index.
         bool isHidden(int tileIndex, int generation) const { return engine_->isHidden(tileIndex, generation); }
         // Whether `tile`, which setTile() has sent, hides the inputs of higher generations. If it does, call hide() for
         // the ranks that have such inputs. Any thread. Waits for nothing.
         bool hidesRest(const Tile& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         bool hidesRest(const TileView& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
-        // Tells `rank` that inputs of this generation and higher ones cannot be seen. The owner drops those that come
-        // nevertheless. Any thread. Waits for nothing. Throws InvalidArgument if there is no such tile or rank, if
-        // `generation` is below 1, or if opaqueHides(tileIndex) is false.
+        // Tells `rank` that inputs of this generation and higher ones cannot be seen. The tile operation drops those
+        // that come nevertheless. Any thread. Waits for nothing. Throws InvalidArgument if there is no such tile or
+        // rank, if `generation` is below 1, or if opaqueHides(tileIndex) is false.
         void hide(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Hides});
@@ -120,19 +122,20 @@ public:
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Shows});
         }
-        // Whether another rank has called mayHide() for an input of that tile and generation, but neither hide() nor
-        // show() yet. Any thread. Waits for nothing. Nobody checks the index.
+        // Whether this rank was told, by mayHide(), that inputs of that generation may be hidden, and not yet by hide()
+        // or show() whether they are. Any thread. Waits for nothing. Nobody checks the index.
         bool isUndecided(int tileIndex, int generation) const { return engine_->isUndecided(tileIndex, generation); }
-        // Waits until heard() returns true or the frame has failed. heard() is called first, and again after each
-        // hide(), mayHide() or show() of another rank. Runs tasks of the executor meanwhile. Returns false after
-        // FrameBufferConfig::quiet: render without waiting then. One thread at a time may call it; with
-        // Progress::Caller, it must be one that may call MPI. Throws TransportError.
+        // Waits until heard() returns true or the frame has failed, and returns true. Returns false after
+        // FrameBufferConfig::quiet: render without waiting then. heard() is called first, and again after each hide(),
+        // mayHide() or show() of another rank. It may call isHidden(), isUndecided() and failed() only, as a lock is
+        // held. Runs tasks of the executor meanwhile. One thread at a time may call it; with Progress::Caller, it must
+        // be one that may call MPI. If the transport fails, it returns true or throws TransportError.
         bool waitForWord(const std::function<bool()>& heard) const { return engine_->waitForWord(heard); }
 
-        // Declares the inputs of generation 1 that this rank will send in each pass. In a frame with
-        // FrameConfig::declared every rank must call it once, with an empty list if it has no inputs; otherwise end()
-        // fails the frame. It may come after the first setTile(). Children that these inputs announce are not declared.
-        // A declared input must be sent even if it is empty; it then costs a header. A list equal to that of the last
+        // Declares inputs of generation 1. They must then come in each pass; one without pixels costs a header. Each is
+        // declared by one rank, which need not be the one that sends it. In a frame with FrameConfig::declared every
+        // rank must call this once, with an empty list if it declares nothing; otherwise end() fails the frame. It may
+        // come after the first setTile(). Children of these inputs are not declared. A list equal to that of the last
         // frame is not sent again. Only one thread may call it. Waits for nothing. Throws InvalidArgument, with nothing
         // declared, for a tile outside the image, for a second call, and in a frame without FrameConfig::declared.
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
@@ -146,11 +149,11 @@ public:
         TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 
         // Hands out the jobs [0, count) to all ranks: returns the next range for this rank. Each job goes to one rank.
-        // An empty range means that no jobs are left, or that the frame has failed. `count` must be the same on all
-        // ranks and in all calls. Only the thread that began the frame may call it, and not from a task. Waits for the
-        // rank that hands out the jobs, usually not for long, because the previous call has already asked for this
-        // range. If it waits longer than FrameConfig::timeout, the frame fails. Throws TransportError, and
-        // InvalidArgument for a count below 0.
+        // An empty range means that no jobs are left, or that the frame or the transport has failed. `count` must be
+        // the same on all ranks and in all calls. Only the thread that began the frame may call it, and not from a
+        // task. Waits for the rank that hands out the jobs, usually not for long, because the previous call has asked
+        // for this range. If it waits longer than FrameConfig::timeout, the frame fails. Throws InvalidArgument for a
+        // count below 0.
         JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
         // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. Use it for
@@ -185,12 +188,12 @@ public:
             }
         }
 
-        // Calls job(i, tile) for each i in [0, count), on this thread and the workers of the executor. Each thread has
-        // a tile of its own: a Tile, or a TileView if that is the template argument. The job calls start(tile, ...),
-        // renders, and calls setTile(tile); several threads call it at once. Any thread may call forEachTile(). Not
-        // collective. Waits until all jobs have returned; it waits for other ranks only inside setTile(). Throws
-        // nothing: an exception of a job makes the frame fail as in guard(), and no other job begins; with
-        // FrameConfig::allowPartial the frame goes on without that job's tile.
+        // Calls job(i, tile) for each i in [0, count), by Executor::parallelFor(), so several threads call it at once.
+        // Each thread has a tile of its own: a Tile, or a TileView if that is the template argument. The job calls
+        // start(tile, ...), renders, and calls setTile(tile). Any thread may call forEachTile(). Not collective. Waits
+        // until all jobs have returned; it waits for other ranks only inside setTile(). Throws nothing: an exception of
+        // a job makes the frame fail as in guard(), and no other job begins; with FrameConfig::allowPartial the frame
+        // goes on without that job's tile.
         template <class WorkerTile = Tile, class Job>
         void forEachTile(std::int64_t count, const Job& job)
         {
@@ -249,8 +252,8 @@ public:
         // frame has failed. It fails, too, if nothing is under way that could complete it (ErrorKind::MissingInput).
         // Throws FrameError, the same on every rank; with FrameConfig::allowPartial it returns instead, with
         // FrameReport::failure set, unless ranks disagree. Throws TransportError. In all these cases the frame is over;
-        // after a FrameError the next one may begin. Throws InvalidArgument on a thread that may not call MPI (see
-        // Progress); the frame is still open then.
+        // after a FrameError the next one may begin. Throws InvalidArgument after the frame has ended, and on a thread
+        // that may not call MPI (see Progress), which leaves the frame open.
         FrameReport end()
         {
             requireOpen();
@@ -297,8 +300,8 @@ public:
     };
 
     // Makes a connection over the communicator and a framebuffer on it. Collective. Waits for all ranks. Throws
-    // InvalidArgument on every rank if the configuration is wrong on any rank or differs between ranks, and
-    // TransportError if the transport cannot be used.
+    // InvalidArgument on every rank if the configuration is wrong on any rank or differs between ranks, or if a rank
+    // lacks memory; TransportError if the transport cannot be used; std::system_error on a rank that gets no threads.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
         : DistributedFrameBuffer(communicator, std::move(config), NetworkConfig(), std::move(pixelOp))
     {
@@ -326,8 +329,8 @@ public:
     DistributedFrameBuffer(const DistributedFrameBuffer&) = delete;
     DistributedFrameBuffer& operator=(const DistributedFrameBuffer&) = delete;
 
-    // Collective. No frame may be open. Must come before MPI_Finalize(). The last object of a connection waits for all
-    // ranks.
+    // Collective. If a frame is open, it ends the process by std::abort(). Must come before MPI_Finalize(). The last
+    // object of a connection waits for all ranks.
     ~DistributedFrameBuffer()
     {
         for (const auto& engine : engines_)
@@ -377,12 +380,12 @@ public:
     bool poll() { return engine().poll(); }
 
     // Begins a frame. Every rank must call it, with an equal `params`. All ranks must call begin() and end() in the
-    // same order: setTile() may wait for room at a rank, and there is none before that rank has begun the frame. Copies
-    // `tileData` and `pixelData`. `failure`: an exception that was thrown while `params` were made, if any; end() then
-    // throws a FrameError with its text on all ranks, as after Frame::abort(). Waits for no other rank. Throws
-    // InvalidArgument, with nothing sent, if the frame that was begun config.framesInFlight frames ago is still open,
-    // if a field of `params` is out of range, or on a thread that may not call MPI (see Progress). Throws
-    // TransportError if the connection has failed.
+    // same order: setTile() may wait for a rank to take messages, which it does only after it has begun their frame.
+    // Copies `tileData` and `pixelData`. `failure`: an exception that was thrown while `params` were made, if any. If
+    // it is given, or if copying or newFrame() of the pixel operation throws, end() throws a FrameError with the text
+    // on all ranks, as after Frame::abort(). Waits for no other rank. Throws InvalidArgument, with nothing sent, if the
+    // frame that was begun config.framesInFlight frames ago is still open, if a field of `params` is out of range, or
+    // on a thread that may not call MPI (see Progress). Throws TransportError if the connection has failed.
     Frame begin(const FrameConfig& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {}, const std::exception_ptr& failure = nullptr)
     {
@@ -413,8 +416,9 @@ public:
     }
 
     // Returns memory for pixels that all ranks of the node can read: see TileView::staysUntilEnd. It is not cleared,
-    // and aligned to 64 bytes. If there is no shared memory, or no more of it (4 GiB a rank), it is memory of this rank
-    // alone, and pixels in it must be sent. Any thread. Waits for nothing. Throws OutOfMemory.
+    // and aligned to 64 bytes. If it is small (1536 bytes), or there is no shared memory, or no more of it (4 GiB a
+    // rank), it is memory of this rank alone, and pixels in it must be sent. Any thread. Waits for nothing. Throws
+    // OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
     using Reduce = dfb::Reduce;
