@@ -1,7 +1,7 @@
 // The errors of dfb: a record of each error and its place, and the exceptions that carry it.
 //
-// InvalidArgument is thrown by the call that was wrong; collective calls throw it on all ranks. An error in the
-// background of a frame comes out of Frame::end() as FrameError, the same on every rank.
+// InvalidArgument is thrown by the call that was wrong; collective calls throw it on all ranks unless they say
+// otherwise. An error in the background of a frame comes out of Frame::end() as FrameError, the same on every rank.
 #pragma once
 
 #include <dfb/compiled.hpp>

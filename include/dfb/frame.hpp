@@ -68,11 +68,11 @@ struct FrameBufferConfig {
     // CallerExecutor makes no threads. Ranks may give different ones.
     std::shared_ptr<Executor> executor{};
     // onTile(tile index, its pixels, image), for windows that show a frame while it is made. Called on the display rank
-    // for each composited tile, when its pixels are in the image of the open frame. With the operations of the library,
-    // these are the tiles that have an active pixel. Worker threads call it, and your own threads in setTile(), poll(),
-    // loops and calls that wait, such as end(); for several tiles at once, while other pixels of the image are still
-    // being written. It must be quick. An exception makes the frame fail. For tiles whose owners are on the display
-    // rank's node, all calls may come at the end of the frame.
+    // for each composited tile, when its pixels are in the image of the open frame. The library's operations, except
+    // Progressive, leave out a tile whose inputs are all empty, unless the pixel operation is not pointwise. Worker
+    // threads call it, and your own threads in setTile(), poll(), loops and calls that wait, such as end(); for several
+    // tiles at once, while other pixels of the image are still being written. It must be quick. An exception makes the
+    // frame fail. For tiles whose owners are on the display rank's node, all calls may come at the end of the frame.
     TileCallback onTile{};
     // After this time in end(), ranks check whether a message is still under way; they check again at growing
     // intervals. If no message is, the frame fails with ErrorKind::MissingInput. 1 ms to 24 days. A short time costs a
@@ -102,8 +102,8 @@ struct FrameConfig {
     // well. An operation without keepsState begins with sample 0, and may leave tiles out only with framesInFlight 1
     // and a pixel operation that is pointwise.
     SamplePlan samples;
-    // For an ErrorBudget: the most inputs that a pixel has in a pass. 0: not known, counts as 65536. ImageParallelLoop,
-    // MixedParallelLoop, OrderedLoop and ImageCompositor set it; DataParallelLoop and DeepParallelLoop do not.
+    // For an ErrorBudget or HalfLevel: the most inputs that a pixel has in a pass. 0: not known, counts as 65536.
+    // ImageParallelLoop, MixedParallelLoop, OrderedLoop and ImageCompositor set it; the other loops do not.
     int maxLayers = 0;
     // For tile operations with keepsState, such as Progressive: the image is the mean of the samples of all consecutive
     // frames with this id. Give another id when camera, scene or background change; the samples of each tile then begin
@@ -114,10 +114,10 @@ struct FrameConfig {
     // True: each rank calls Frame::declare(), and owners wait for the declared inputs. Loops set it themselves.
     bool declared = false;
     // The frame fails with ErrorKind::TimedOut if it is not complete this long after a rank called end(). It also fails
-    // if setTile() waits for room, and no receiver takes a message of this rank for this long. The error says what is
-    // missing and from whom. If there is still no verdict after twice the time, end() throws TransportError. 0: no
-    // limit. At most 24 days. An input that is never sent needs no time-out: the frame fails with
-    // ErrorKind::MissingInput some seconds after all ranks are in end().
+    // if setTile() waits for room, and no receiver takes a message of this rank for this long; or if nextJobs() waits
+    // this long. The error says what is missing and from whom. If there is still no verdict after twice the time, end()
+    // throws TransportError. 0: no limit. At most 24 days. An input that is never sent needs no time-out: the frame
+    // fails with ErrorKind::MissingInput some seconds after all ranks are in end().
     std::chrono::milliseconds timeout{0};
     // For AlphaBlend. If not null, it lists the sources of all inputs, front to back for every ray of the frame. Inputs
     // are then blended in this order: nothing is sorted, and no depth travels unless the image has it. The pixels are
@@ -136,7 +136,7 @@ struct FrameConfig {
     bool allowPartial = false;
 };
 
-// A declaration that a rank will send an input of generation 1 for this tile in each pass of the frame.
+// Declares that an input of generation 1 will come for this tile in each pass of the frame.
 struct TileInput {
     int tile = 0;
     std::uint32_t source = 0;
@@ -191,8 +191,8 @@ struct FrameSums {
 struct FrameReport : FrameSums {
     std::int64_t frame = 0;
     std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why tiles are missing, if any are
-    // All: tiles that were not finished. On the display rank finished tiles that have not reached it count, too, and
-    // background tiles for which the pixel operation threw. Such tiles show the background.
+    // All: tiles that were not finished. More on the display rank: also finished tiles that have not reached it, and
+    // background tiles for which the pixel operation threw. All these tiles show the background.
     std::int64_t tilesIncomplete = 0;
     double totalMs = 0;               // begin() to the return of end(), this rank
     double renderMs = 0;              // begin() to the call of end(), this rank
@@ -212,7 +212,7 @@ struct FrameReport : FrameSums {
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: the sums of Frame::addFigure(), by key
     std::int64_t peakInboxBytes = 0;   // all: the most bytes limited by messages.poolBytes that a rank's inbox held
-    std::int64_t peakMemoryBytes = 0;  // all: the most message and image memory that a rank's framebuffer ever held
+    std::int64_t peakMemoryBytes = 0;  // all: the most message and image memory that a rank's connection ever held
 };
 
 DFB_NAMESPACE_END
