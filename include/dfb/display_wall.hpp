@@ -48,7 +48,7 @@ public:
     // Makes a wall whose displays show images in `format`. `executor` runs its work; null: threads of its own, beside
     // those of the framebuffers. `poolBytes`: as MessageConfig::poolBytes. Collective, in the same order as the
     // framebuffers of the connection. Waits for all ranks. Throws InvalidArgument on all ranks if the layout is wrong,
-    // if `layout`, `format` or `poolBytes` differ between ranks, or if a rank has no memory for it.
+    // if `layout`, `format` or `poolBytes` differ between ranks, or if a rank lacks memory. Throws TransportError.
     DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout, OutputFormat format,
                 std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20);
 
@@ -64,13 +64,13 @@ public:
 
     // Waits until all displays have frame number `frame`: that is the moment to show it on all of them. Collective.
     // Call it once for each frame, after the frame has ended, in the order of the frames. A display's rank keeps parts
-    // of 16 frames at most, and drops the oldest if later ones come. All frames of a wall must be of one framebuffer.
-    // Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks: TimedOut if a display
-    // has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have not sent all of it,
-    // because it failed or was partial, or if a display has dropped it; MalformedMessage if a part of it cannot be
-    // right. The displays then keep their picture. Throws TransportError if the connection fails, and InvalidArgument
-    // on a thread that may not call MPI, or for a frame that is not later than the last or that no rank can
-    // have begun.
+    // of 16 frames at most, and drops the oldest if later ones come. All frames of a wall must be of one framebuffer,
+    // before its resize(). Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks:
+    // TimedOut if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have
+    // not sent all of it, because it failed or was partial, or if a display has dropped it; MalformedMessage if a part
+    // of it cannot be right. The displays then keep their picture. Throws TransportError if the connection fails.
+    // Throws InvalidArgument, on this rank alone, on a thread that may not call MPI, or for a frame that is not later
+    // than the last or that no rank can have begun.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before

@@ -66,8 +66,8 @@ public:
     }
 
     // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Any thread may call it,
-    // several at once. Waits until all these calls have returned. In a task of a ThreadExecutor, the loop runs on the
-    // thread of that task. Rethrows the first exception of a body; after it no other body begins.
+    // several at once. Waits until all these calls have returned. On a worker of a ThreadExecutor, that thread alone
+    // runs the loop. Rethrows the first exception of a body; after it no other body begins.
     void parallelFor(std::size_t count, const std::function<void(std::size_t)>& body)
     {
         if (count == 0)

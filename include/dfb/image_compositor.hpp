@@ -46,7 +46,8 @@ enum class ImageBlend : std::uint8_t {
 struct InputImage {
     // This rank has nothing to show.
     InputImage() = default;
-    // 4 bytes or floats a pixel, and a depth for each pixel. `depths` may be null for ImageBlend::InOrder.
+    // 4 bytes or floats a pixel, and a depth for each. With ImageBlend::InOrder only a picture with depth needs
+    // `depths`.
     explicit InputImage(const std::uint8_t* bytes, const float* depths = nullptr) : rgba8(bytes), depth(depths) {}
     explicit InputImage(const float* floats, const float* depths = nullptr) : rgba32f(floats), depth(depths) {}
 
@@ -63,8 +64,8 @@ struct InputImage {
     // A pixel at this depth or beyond is empty; 1 in OpenGL. Infinity: no limit.
     float farDepth = std::numeric_limits<float>::infinity();
     // The part of the picture that the memory holds; pixels outside of the picture are not read. x counts from the
-    // left, y from the first row in memory. {0, 0, 0, 0}: the whole picture. Any other region without pixels means that
-    // this rank has nothing to show.
+    // left, y from the first row in memory. {0, 0, 0, 0}: the whole picture. Any other region of width or height 0:
+    // this rank has nothing to show. A region of negative width or height is an error.
     Region region{0, 0, 0, 0};
     // Pixels outside of this part of the picture are empty and not read. Its coordinates are those of `region`. By
     // default it is everything.
@@ -126,8 +127,8 @@ public:
     // each picture, then end(). The image's memory may be used again when this returns, unless you have promised
     // InputImage::staysUntilEnd. Waits for another rank only if this one has too much under way
     // (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open, if a field of `frame` is out of range,
-    // or on a thread that may not call MPI. Throws TransportError. If the image or `place` is wrong, end() throws on
-    // all ranks.
+    // or on a thread that may not call MPI. Throws TransportError. If the image, `place`, or the samples in `frame` are
+    // wrong, end() throws on all ranks.
     void start(const InputImage& image, int place, const FrameConfig& frame = {});
     void start(const InputImage& image, const FrameConfig& frame = {}) { start(image, -1, frame); }
     // In place of start(), on a rank that could not make its image: end() throws a FrameError with the text of `why`
