@@ -88,8 +88,8 @@ private:
 
 } // namespace detail
 
-// Which rank renders which tile (section 4.1.1 of the paper). Passes are dealt out like tiles, so a tile that needs
-// many samples is rendered by many ranks; the image does not depend on which rank renders a tile.
+// Which rank renders which tile (section 4.1.1 of the paper). All but Owned deal out passes like tiles, so a tile that
+// needs many samples is rendered by many ranks; the image does not depend on which rank renders a tile.
 enum class WorkDistribution : std::uint8_t {
     Owned,      // a rank renders the tiles that it owns: no input travels
     Linear,     // equal contiguous shares in the order of tiles
@@ -124,11 +124,11 @@ public:
     {
     }
 
-    // Begins a frame, renders this rank's share, and returns the frame: call end(). renderTile(tile) writes the pixels
-    // of tile.region into the cleared tile. Several threads call it at once, for each pass with its own tile.pass and
-    // tile.sample. Returns when this rank has rendered its share. Waits for other ranks only for room, as setTile(),
-    // and with WorkDistribution::Dynamic for jobs. Throws what FrameBuffer::begin() throws. An exception of renderTile
-    // comes out of Frame::end() on all ranks, as a FrameError.
+    // Begins a frame, renders this rank's share, and returns the frame: call end(). All ranks must call it.
+    // renderTile(tile) writes the pixels of tile.region into the tile, which Frame::start() has cleared. Several
+    // threads call it at once, for each pass with its own tile.pass and tile.sample. Waits for other ranks only for
+    // room, as setTile(), and with WorkDistribution::Dynamic for jobs. Throws what FrameBuffer::begin() throws. An
+    // exception of renderTile comes out of Frame::end() on all ranks, as a FrameError.
     template <class RenderTile>
     typename FrameBuffer::Frame start(const RenderTile& renderTile, FrameConfig params = {},
                                       const typename FrameBuffer::TileFrameData& tileData = {},
@@ -298,19 +298,20 @@ public:
     DataParallelLoop(FrameBuffer& fb, const World& world) : fb_(fb), world_(world) {}
 
     // `all` has the bricks of all ranks, those of `world` among them. It must outlive the loop. If the bricks have an
-    // order from front to back for the camera, the loop sets FrameConfig::order: AlphaBlend then sends no depth, and
-    // sorts nothing. If ranks are on several nodes, tiles belong to ranks near their pixels: see ImageConfig::ownerMap.
+    // order from front to back for the camera, the loop sets FrameConfig::order: AlphaBlend then sorts nothing, and
+    // depth is neither cleared nor sent unless the image has it. If ranks are on several nodes, tiles belong to ranks
+    // near their pixels: see ImageConfig::ownerMap.
     DataParallelLoop(FrameBuffer& fb, const World& world, const SharedWorld& all) : fb_(fb), world_(world), all_(&all)
     {
     }
 
     // Begins a frame, renders all bricks of the world into the tiles that they may project to, and returns the frame:
-    // call end(). renderBrick(brick, tile) writes colour and depth of the pixels of tile.region into the cleared tile,
-    // as far as their rays are within brick.bounds; depth grows away from the camera. Several threads call it at once,
-    // for each pass with its own tile.pass. Unlike in Listing 3, each rank declares its inputs, so that owners need not
-    // know the bricks. Returns when this rank has rendered its share. Waits for other ranks only for room, as
-    // setTile(). Throws what FrameBuffer::begin() throws. An exception of renderBrick comes out of Frame::end() on all
-    // ranks, as a FrameError.
+    // call end(). All ranks must call it. renderBrick(brick, tile) writes colour and depth of the pixels of
+    // tile.region, as far as their rays are within brick.bounds; depth grows away from the camera. Frame::start() has
+    // cleared the tile. Several threads call renderBrick at once, for each pass with its own tile.pass. Unlike in
+    // Listing 3, each rank declares its inputs, so that owners need not know the bricks. Waits for other ranks only for
+    // room, as setTile(). Throws what FrameBuffer::begin() throws. An exception of renderBrick or the camera comes out
+    // of Frame::end() on all ranks, as a FrameError.
     template <class Camera, class RenderBrick>
     typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick, FrameConfig params = {},
                                       const typename FrameBuffer::TileFrameData& tileData = {},

@@ -45,7 +45,7 @@ struct RoundRobinBricks {
 
 // Deals the passes of tiles so that all ranks have equally much to do. It uses the cost of the same brick and tile in
 // the last frame; if that is not known, the mean cost of the brick, or of all bricks. Call update() after each frame.
-// The cost is the number that renderBrick returns, or else the time that it took.
+// The cost is the number that renderBrick returns, or else the time that it took, in ns.
 class MeasuredCostBricks {
 public:
     // Takes the costs of the frame of this report, and forgets all others. A cost that is not finite counts as not
@@ -315,7 +315,7 @@ void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& r
 
 // A DataParallelLoop for bricks that several ranks may hold. For each tile and pass `owner` picks the rank that renders
 // the brick. The image is that of data-parallel rendering, bit for bit, whichever ranks it picks. Framebuffer, world
-// and owner must outlive it. AlphaBlend sorts no pixels where the bricks have an order: see FrameConfig::order.
+// and owner must outlive it. One thread at a time may use it. Sets FrameConfig::order where the bricks have one.
 template <class FrameBuffer, class TileBrickOwner>
 class MixedParallelLoop {
 public:
@@ -391,8 +391,9 @@ public:
     {
     }
 
-    // As MixedParallelLoop::start(). `order`: the bricks front to back, by their place in world.bricks(), as
-    // visibilityOrder() returns them. If it does not have each brick once, the frame fails (InvalidArgument).
+    // As MixedParallelLoop::start(), but also waits for ranks that may hide inputs. `order`: the bricks front to back,
+    // by their place in world.bricks(), as visibilityOrder() returns them; each once, or the frame fails
+    // (InvalidArgument).
     template <class Camera, class RenderBrick>
     typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
                                       const RenderBrick& renderBrick, FrameConfig params = {},

@@ -259,7 +259,7 @@ struct Ray {
     Vec3 origin, direction;
 };
 
-// The point of the lens and the moment of the shutter for a ray.
+// The point of the lens and the moment of the shutter for a ray, as numbers in [0, 1).
 struct LensSample {
     double lensU = 0, lensV = 0, time = 0;
 };
