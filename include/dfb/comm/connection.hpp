@@ -42,9 +42,9 @@ struct NetworkConfig {
     // reduction waits after a message that could not be read; for this 0 means no limit, unless the frame has a
     // time-out.
     std::chrono::milliseconds peerTimeout = defaultPeerTimeout;
-    // Called by a thread of the library when a rank is lost, once, on one or several of the other ranks. It must be
-    // quick and must not throw. All ranks then get a TransportError with the lost rank in ErrorInfo::rank. Null: the
-    // error is printed to standard error, and the job ends with MPI_Abort, because MPI does not go on without a rank.
+    // Called once when a rank is lost, on one or several of the others, by a thread of the library or the one that
+    // destroys the connection. It must be quick and not throw. All ranks then get a TransportError with the lost rank
+    // in ErrorInfo::rank. Null: the error is printed, and MPI_Abort ends the job, as MPI does not go on without a rank.
     std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 
@@ -565,8 +565,8 @@ private:
 
 // Connects the ranks of a communicator, for framebuffers, compositors and walls that share the connection. Collective,
 // as is the destruction of the connection. Waits for all ranks. With MPI below MPI_THREAD_SERIALIZED it must be called
-// by the thread that initialised MPI. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator, and
-// TransportError.
+// by the thread that initialised MPI. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator; TransportError;
+// and std::system_error on a rank that gets no thread.
 template <class Transport = MpiTransport>
 std::shared_ptr<Connection> connect(const typename Transport::Communicator& communicator, NetworkConfig config = {})
 {

@@ -166,9 +166,9 @@ static_assert(is_transport_v<InprocTransport>);
 DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<InprocTransport>(const InprocCommunicator&, NetworkConfig));
 
 // Calls `body(communicator)` on `rankCount` new threads, one for each rank. Any thread may call it. Waits until all
-// have returned. If a body throws, the ranks that wait for it get a TransportError, and the first exception is rethrown
-// here. Throws InvalidArgument for less than 1 rank. Throws std::system_error if the system gives no more threads; the
-// ranks that have begun then get a TransportError.
+// have returned. If a body throws, the connections of the other ranks fail with a TransportError, and the first
+// exception is rethrown here. Throws InvalidArgument for less than 1 rank. Throws std::system_error if the system gives
+// no more threads; the ranks that have begun then get a TransportError.
 inline void runRanks(int rankCount, const std::function<void(InprocCommunicator)>& body)
 {
     if (rankCount < 1)

@@ -49,12 +49,12 @@ public:
     static constexpr int postedPackets = 8;                         // receives of packets posted at a time
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // the most that one call sends: counts are ints
 
-    // Collective over `communicator`. Below MPI_THREAD_SERIALIZED it must be called by the thread that initialised MPI.
-    // Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator. Throws TransportError if MPI is not
-    // initialised, or is finalised. Throws TransportError on all ranks if they were built with different packet
-    // formats, or if one of them cannot make its transport; the error then has that rank and the reason. One such
-    // reason is that MPI was initialised there below MPI_THREAD_MULTIPLE and `progress` is Thread. Only if a collective
-    // of MPI fails on one rank, or finds no memory there for its result, the others cannot be told, and wait.
+    // Collective over `communicator`. Waits for all ranks. Throws InvalidArgument for MPI_COMM_NULL or an
+    // intercommunicator. Throws TransportError if MPI is not initialised, or is finalised, and below
+    // MPI_THREAD_SERIALIZED on any thread but the one that initialised it. Throws TransportError on all ranks if they
+    // were built with different packet formats, or if one of them cannot make its transport; the error then has that
+    // rank and the reason, such as that `progress` is Thread and MPI is below MPI_THREAD_MULTIPLE there. Only if a
+    // collective of MPI fails on one rank, or finds no memory there for its result, the others wait.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : onlyThread_(onlyThread()),
           noFinalize_(progress != Progress::Caller && detail::mpiLevel() == MPI_THREAD_MULTIPLE),
@@ -73,6 +73,7 @@ public:
             throw TransportError(ranks_.reason(), failed);
         }
     }
+    // Frees the duplicate of the communicator, which is collective, unless stop() was not orderly.
     ~MpiTransport()
     {
         if (comm() != MPI_COMM_NULL && !detail::mpiSays(MPI_Finalized))
@@ -112,9 +113,8 @@ public:
     {
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
     }
-    // Naps are longer where ranks share cores, because waking up takes the core from a rank that computes. Naps of at
-    // least 10 ms keep their length. If all that this rank waits for comes from this node, naps are long, since the
-    // doorbell ends them.
+    // Naps of less than 10 ms are longer where ranks share cores, because waking up takes the core from a rank that
+    // computes. If all that this rank waits for comes from this node, naps are long, since the doorbell ends them.
     void nap(std::chrono::nanoseconds limit)
     {
         napLimit_ = limit;
@@ -160,7 +160,7 @@ public:
     }
 
     // An orderly stop is collective: it serves the other ranks until all have called stop(), then goes on until all
-    // messages have come. MPI has nothing left of this transport then.
+    // messages have come. MPI has no request of this transport left then.
     void stop(bool orderly)
     {
         if (detail::mpiSays(MPI_Finalized)) {
