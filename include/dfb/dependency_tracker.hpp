@@ -1,9 +1,9 @@
 // DependencyTracker: the dependency tree of one tile and pass (section 3.1.1 of the paper): which inputs have arrived,
 // which are missing, and every way in which inputs can contradict each other.
 //
-// An input is a member of a generation and announces children in the next; the sum over generation g is the size
-// of generation g + 1. Generation 0 has `rootCount` members. Inputs arrive in any order. The tree is complete when
-// every announced input has arrived.
+// An input is a member of a generation and announces children in the next; the sum over generation g is the size of
+// generation g + 1. Generation 0 has `rootCount` members. Inputs arrive in any order. The tree is complete when every
+// announced input has arrived. One thread at a time may use it.
 #pragma once
 
 #include <dfb/error.hpp>

@@ -2,7 +2,7 @@
 // output format (section 3.1.2 of the paper).
 //
 // A PixelOp is a copyable type. Each rank keeps one copy for each frame in flight, and calls process() for several
-// tiles at once.
+// tiles at once. An exception makes the frame fail on all ranks, with its text.
 //
 //   void process(PixelTile&) const;              changes the pixels, sends them elsewhere, ...
 //

@@ -242,7 +242,7 @@ struct TileView : TileHeader {
     // read in place if this rank owns the tile, or if the owner is on the same node and they are in memory of
     // sharedMemory(). They are nevertheless copied if the operation has no readsInPlace or keeps state, if a channel
     // other than colour and depth is sent, or with a WireFormat that rounds, an ErrorBudget, minTransmittance above 0,
-    // or HalfLevel for an 8-bit image of ranks on several nodes. After a TransportError do not write to such memory
+    // or HalfLevel for an 8-bit image if not all ranks share memory. After a TransportError do not write to such memory
     // until the framebuffer is destroyed. NetworkConfig::checksums finds broken promises.
     bool staysUntilEnd = false;
 

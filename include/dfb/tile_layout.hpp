@@ -71,8 +71,8 @@ private:
     int tilesX_ = 0, tilesY_ = 0;
 };
 
-// Names the rank in [0, rankCount) that owns a tile. A pure function, the same on all ranks; it is asked once per
-// tile when the framebuffer is made.
+// Names the rank in [0, rankCount) that owns a tile. A pure function, the same on all ranks. The constructor of a
+// framebuffer and resize() call it for each tile, and throw InvalidArgument on all ranks if it throws or names no rank.
 using OwnerMap = std::function<int(int tile, const TileLayout& layout, int rankCount)>;
 
 // The rank that owns each tile, by the tile's index.

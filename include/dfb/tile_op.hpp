@@ -2,7 +2,7 @@
 //
 // A TileOp is a default-constructible type. A rank makes an object when a tile that it owns first needs one, for each
 // frame in flight. If owners change, an object without keepsState may serve another tile later. Calls for one tile come
-// one after the other, from any worker, so the operation needs no mutex; calls for different tiles may come at once. It
+// one after the other, from any thread, so the operation needs no mutex; calls for different tiles may come at once. It
 // does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks, with its text.
 //
 // All passes of a tile come to one object. The operation itself composites each pass (TileHeader::pass), lays each over
@@ -73,7 +73,7 @@ struct TileInfo {
     Region region;                               // the tile's pixels
     int passes = 1;                              // samples a pixel; each pass has a dependency tree of its own
     int firstSample = 0;                         // the sample number of pass 0, over all frames that accumulate
-    int emptySamples = 0;                        // the number of samples before it, if none of them had an input
+    int emptySamples = 0;                        // the number of samples before firstSample, if none had an input
     std::uint64_t accumulationId = 0;            // if it changes, the samples accumulated before are of no use
     float minTransmittance = 0;                  // a pixel whose layers let less than this through counts as opaque
     ChannelMask wanted = 0;                      // channels of the image beside the colour
@@ -122,7 +122,7 @@ public:
     double setRow(int y, const Real* rgba, const float* depth, const AuxRow& aux = {});
 
     // Sets pixels [x, x + count) of row y, in place of setRow(), in an image without dithering and without auxiliary
-    // channels. Every pixel must be set once.
+    // channels. `depth` may be null if the image has none. Every pixel must be set once. Returns what setRow() does.
     double setPixels(int x, int y, int count, const double* rgba, const float* depth);
     // Sets the colour of pixels [x, x + count) of row y from floats, which a float image gets as they are; -0 becomes
     // 0.
