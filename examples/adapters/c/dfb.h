@@ -32,11 +32,11 @@ typedef struct dfb_framebuffer dfb_framebuffer;
 
 enum dfb_status {
     DFB_OK = 0,
-    DFB_INVALID_ARGUMENT = 1, // a call that can never be right; nothing has changed
+    DFB_INVALID_ARGUMENT = 1, // a wrong argument, or a call that is not allowed now; nothing has changed
     DFB_FRAME_FAILED = 2,     // the picture could not be made, on all ranks; the next can be
     DFB_TRANSPORT_FAILED = 3, // MPI cannot be used, or a rank is lost: the framebuffer is of no further use
-    DFB_OUT_OF_MEMORY = 4,
-    DFB_FAILED = 5
+    DFB_OUT_OF_MEMORY = 4,    // on this rank
+    DFB_FAILED = 5            // anything else, such as that the system gives no more threads
 };
 
 // How the inputs of a pixel become one.
@@ -69,8 +69,8 @@ typedef struct dfb_config {
     // The longest time for a picture in milliseconds, counted from when this rank has drawn or given its part. If the
     // picture is not complete by then, the call returns DFB_FRAME_FAILED; if a rank does not answer at all, as when it
     // is dead, DFB_TRANSPORT_FAILED after twice the time. The error says which rank it waited for. Default: 0, no
-    // limit. Other calls have no limit, nor has the first dfb_render() after dfb_create() or dfb_resize(): it makes what
-    // later ones use.
+    // limit. Other calls have no limit, nor has the first dfb_render() after dfb_create() or dfb_resize(): it makes
+    // what later ones use.
     int timeout_ms;
 } dfb_config;
 
@@ -80,10 +80,10 @@ void dfb_config_init_sized(dfb_config* config, size_t struct_size, int width, in
 
 // Makes a framebuffer on a duplicate of the communicator, with the calling thread, and stores it in *framebuffer; NULL
 // if there was an error. MPI must have been initialised, at any thread level. Collective; waits for all ranks.
-// DFB_INVALID_ARGUMENT on all ranks if the configuration is wrong on any rank or differs between ranks. Backgrounds
-// or time-outs that differ fail each picture.
+// DFB_INVALID_ARGUMENT on all ranks if the configuration is wrong on any rank or differs between ranks, or if a rank
+// lacks memory. Backgrounds or time-outs that differ fail each picture.
 int dfb_create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer** framebuffer);
-// The same with a Fortran handle: the one of `use mpi`, or the mpi_val of a communicator of `use mpi_f08`.
+// For a Fortran handle: the one of `use mpi`, or the mpi_val of a communicator of `use mpi_f08`. Otherwise as above.
 int dfb_create_fortran(MPI_Fint communicator, const dfb_config* config, dfb_framebuffer** framebuffer);
 
 // Destroys a framebuffer; call it before MPI_Finalize(). Pointers to its picture become invalid. Null is ignored.
@@ -91,7 +91,7 @@ int dfb_create_fortran(MPI_Fint communicator, const dfb_config* config, dfb_fram
 void dfb_destroy(dfb_framebuffer* framebuffer);
 
 // Changes the size of the picture, which is empty then. Collective; waits for all ranks. DFB_INVALID_ARGUMENT on all
-// ranks, with nothing changed, if the size is out of range or differs between ranks.
+// ranks, with nothing changed, if the size is out of range or differs between ranks, or if a rank lacks memory.
 int dfb_resize(dfb_framebuffer* framebuffer, int width, int height);
 
 // The place of this rank in the communicator, and the number of ranks; -1 without a framebuffer.
@@ -113,14 +113,14 @@ typedef struct dfb_input {
     // time.
     const uint8_t* rgba8;
     const float* rgba32f;
-    const float* depth;     // a depth for each pixel, which grows away from the camera; null with DFB_IN_ORDER
+    const float* depth;     // one a pixel, grows away from the camera; with DFB_IN_ORDER only for a picture with depth
     ptrdiff_t row_pixels;   // from a row to the next, of colour and depth; 0: the width of `region`
     int bottom_up;          // 1: the first row is the lowest, as in OpenGL
     int is_bgra;            // 1: the channels are blue, green, red, alpha
     int has_straight_alpha; // 1: colours are not multiplied by alpha yet
     float far_depth;        // a pixel at this depth or beyond is empty; +infinity, in OpenGL 1
     // x0, y0, x1, y1: the part of the picture that the memory holds, [x0, x1) x [y0, y1). x counts from the left, y
-    // from the first row. All zeros: the whole picture. Any other empty part: nothing to show.
+    // from the first row. All zeros: the whole picture. Any other of width or height 0: nothing to show.
     int region[4];
     // Pixels outside of this part of the picture are empty and are not read. Coordinates as in `region`. Default: all
     // of the picture.
