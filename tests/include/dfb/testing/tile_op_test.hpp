@@ -90,8 +90,8 @@ struct TileOutput {
     }
 };
 
-// Runs `op` for a tile in one frame as the framebuffer does. The inputs arrive in this order. Sets `written` to the
-// number of pixels that the operation has set.
+// Runs `op` for a tile in one frame as the framebuffer does, but gives it all inputs, without asking isComplete(). They
+// arrive in this order. Sets `written` to the number of pixels that the operation has set.
 template <class Op>
 TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::vector<std::size_t>& order,
                      OutputFormat format, bool withDepth = true, const TileWire& wire = {}, bool dither = false,

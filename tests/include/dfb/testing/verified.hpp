@@ -1,6 +1,6 @@
 // Verified: a tile operation of the library that checks itself. It compares each finished tile, in all channels that
 // the image has, with the reference for the decoded inputs of the tile. For tests, and for users who want proof; slow.
-// Dithered values are not the rounded exact ones, and count as wrong.
+// Dithered values are not the rounded exact ones, and count as wrong, as do those that minTransmittance changes.
 //
 //   dfb::testing::Verification verification;      // one per rank
 //   DistributedFrameBuffer<dfb::testing::Verified<dfb::AlphaBlend>> fb(...);
