@@ -47,30 +47,29 @@ public:
     using PixelFrameData = typename Operations::PixelFrameData;
 
     // A frame that has begun. If it is destroyed without end(), the frame fails on all ranks (after isDone() it may
-    // also end well), and the destructor waits until all ranks know that.
+    // also end well), and the destructor waits until all ranks know that. Where a member does not say otherwise, any
+    // thread may call it, it waits for nothing, and nobody checks the index of a tile.
     class [[nodiscard]] Frame {
     public:
         Frame(Frame&&) noexcept = default;
         Frame& operator=(Frame&&) = delete;
 
-        // The number of the frame, as in FrameReport::frame. Any thread.
+        // The number of the frame, as in FrameReport::frame.
         std::int64_t number() const noexcept { return number_; }
 
-        // The owner of a tile, and the tiles that this rank owns, in this frame. Any thread. They wait for nothing and
-        // throw nothing. The index is not checked.
+        // The owner of a tile, and the tiles that this rank owns, in this frame.
         int tileOwner(int tile) const noexcept { return engine_->ownerNow(tile); }
         const std::vector<int>& ownedTiles() const noexcept { return engine_->ownedNow(); }
 
         // Prepares `tile` for a tile and a pass of this frame: clears it, and sets generation 0, no children, this rank
         // as source, and part 0. A channel that is not sent in this frame is not cleared, such as depth that neither
-        // the operation nor the image needs. Any thread. Waits for nothing. Throws InvalidArgument for an index or a
-        // pass that the frame does not have.
+        // the operation nor the image needs. Throws InvalidArgument if there is no such tile or pass.
         void start(Tile& tile, int tileIndex, int pass = 0) const
         {
             static_cast<TileHeader&>(tile) = engine_->headerOf(tileIndex, pass);
             tile.clear(engine_->sent());
         }
-        // Prepares a view. Its planes are null afterwards: point them to your pixels. Threads and exceptions as above.
+        // Prepares a view. Its planes are null afterwards: point them to your pixels. Throws as above.
         void start(TileView& tile, int tileIndex, int pass = 0) const
         {
             const TileHeader header = engine_->headerOf(tileIndex, pass);
@@ -79,51 +78,49 @@ public:
         }
 
         // Sends the active pixels of a rendered tile to its owner. `tile` can be used again when setTile() returns.
-        // Sends nothing in a frame that has failed, or after end(), but checks the tile even then. Any thread. Waits
-        // only while more than messages.poolBytes are under way from this rank, and runs tasks of the executor
-        // meanwhile; a thread that may not call MPI does not wait. Throws InvalidArgument, with nothing sent, for a
-        // tile of another frame, for an index, region or pass that the frame does not have, for a generation that is
-        // not 0 to 65535, and for a negative number of children. Throws OutOfMemory, and what the codec throws. An
-        // input that contradicts others (too many, sent twice, not announced) makes the frame fail: end() throws.
+        // Sends nothing in a frame that has failed, or after end(), but checks the tile even then. Waits only while
+        // more than messages.poolBytes are under way from this rank, and runs tasks of the executor meanwhile; a thread
+        // that may not call MPI does not wait. Throws InvalidArgument, with nothing sent, for a tile of another frame,
+        // for an index, region or pass that the frame does not have, for a generation that is not 0 to 65535, and for a
+        // negative number of children. Throws OutOfMemory, and what the codec throws. An input that contradicts others
+        // (too many, sent twice, not announced) makes the frame fail: end() throws.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
         // Sends pixels that lie in your own memory. They are not read after setTile() has returned, unless you promise
-        // TileView::staysUntilEnd. Threads, waiting and exceptions as above. Also throws InvalidArgument if a channel
-        // that must be sent is null, or if rows overlap.
+        // TileView::staysUntilEnd. Waits and throws as above. Also throws InvalidArgument if a channel that must be
+        // sent is null, or if rows overlap.
         void setTile(const TileView& tile) { engine_->setTile(tile); }
 
         // True if this rank was told, by hide(), that inputs of this generation cannot be seen: they need not be
-        // rendered, and setTile() drops them. Always false unless the operation has opaqueHides(). Any thread. Waits
-        // for nothing. Nobody checks the index.
+        // rendered, and setTile() drops them. Always false unless the operation has opaqueHides().
         bool isHidden(int tileIndex, int generation) const { return engine_->isHidden(tileIndex, generation); }
         // Whether `tile`, which setTile() has sent, hides the inputs of higher generations. If it does, call hide() for
-        // the ranks that have such inputs. Any thread. Waits for nothing.
+        // the ranks that have such inputs.
         bool hidesRest(const Tile& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         bool hidesRest(const TileView& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         // Tells `rank` that inputs of this generation and higher ones cannot be seen. The tile operation drops those
-        // that come nevertheless. Any thread. Waits for nothing. Throws InvalidArgument if there is no such tile or
-        // rank, if `generation` is below 1, or if opaqueHides(tileIndex) is false.
+        // that come nevertheless. Throws InvalidArgument if there is no such tile or rank, if `generation` is below 1,
+        // or if opaqueHides(tileIndex) is false.
         void hide(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Hides});
         }
 
-        // Whether opaque inputs of that tile hide the inputs behind them in this frame. Any thread. Waits for nothing.
-        // Nobody checks the index.
+        // Whether opaque inputs of that tile hide the inputs behind them in this frame.
         bool opaqueHides(int tileIndex) const { return engine_->opaqueHides(tileIndex); }
         // Tells `rank` that an input of this rank will probably hide the inputs of `rank` in `generation` and higher
         // ones. `rank` should wait before it renders them. This rank must then call hide() or, if they can be seen,
-        // show(). Threads and exceptions as for hide().
+        // show(). Throws as hide().
         void mayHide(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::MayHide});
         }
-        // Tells `rank`, after mayHide(), that its inputs can be seen. Threads and exceptions as for hide().
+        // Tells `rank`, after mayHide(), that its inputs can be seen. Throws as hide().
         void show(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Shows});
         }
         // Whether this rank was told, by mayHide(), that inputs of that generation may be hidden, and not yet by hide()
-        // or show() whether they are. Any thread. Waits for nothing. Nobody checks the index.
+        // or show() whether they are.
         bool isUndecided(int tileIndex, int generation) const { return engine_->isUndecided(tileIndex, generation); }
         // Waits until heard() returns true or the frame has failed, and returns true. Returns false after
         // FrameBufferConfig::quiet: render without waiting then. heard() is called first, and again after each hide(),
@@ -136,16 +133,15 @@ public:
         // declared by one rank, which need not be the one that sends it. In a frame with FrameConfig::declared every
         // rank must call this once, with an empty list if it declares nothing; otherwise end() fails the frame. It may
         // come after the first setTile(). Children of these inputs are not declared. A list equal to that of the last
-        // frame is not sent again. Only one thread may call it. Waits for nothing. Throws InvalidArgument, with nothing
-        // declared, for a tile outside the image, for a second call, and in a frame without FrameConfig::declared.
+        // frame is not sent again. Only one thread may call it. Throws InvalidArgument, with nothing declared, for a
+        // tile outside the image, for a second call, and in a frame without FrameConfig::declared.
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
 
         // Replaces FrameConfig::maxLayers for the inputs of this rank, for a renderer that learns this number only
-        // after begin(). Ranks may give different numbers. Call it before the first setTile(), on one thread. Waits for
-        // nothing. Throws nothing.
+        // after begin(). Ranks may give different numbers. Call it before the first setTile(), on one thread.
         void expectLayers(int layers) { engine_->expectLayers(layers); }
 
-        // The samples that a tile gets in this frame. Any thread. Waits for nothing. Nobody checks the index.
+        // The samples that a tile gets in this frame.
         TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 
         // Hands out the jobs [0, count) to all ranks: returns the next range for this rank. Each job goes to one rank.
@@ -158,22 +154,20 @@ public:
 
         // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. Use it for
         // measurements that all ranks must know, such as the cost of a brick. The figures are summed when the frame
-        // ends: call it before this rank's end(). Any thread. Waits for nothing.
+        // ends: call it before this rank's end().
         void addFigure(std::uint64_t key, double value) const { engine_->addFigure(key, value); }
 
         // Notes that an input of that tile was simplified, so that a pixel of one pass may be off by up to `bound`, in
-        // units of colour; see FrameReport::mergeErrorBound. Call it before this rank's end(). Any thread. Waits for
-        // nothing. Throws InvalidArgument for a tile outside the image.
+        // units of colour; see FrameReport::mergeErrorBound. Call it before this rank's end(). Throws InvalidArgument
+        // for a tile outside the image.
         void noteMergeError(int tileIndex, double bound) const { engine_->noteMergeError(tileIndex, bound); }
 
         // Whether the frame has failed on some rank, as far as this rank knows. If so, there is no use in rendering on.
-        // Any thread. Waits for nothing.
         bool failed() const noexcept { return engine_->failed(); }
 
         // Calls body(), which is a rendering loop of your own or a part of it. If body() throws, guard() passes the
         // exception to abort(), and end() throws a FrameError with its text on all ranks, including this one. So call
-        // end() in any case. Returns false if there was an exception. Any thread. Waits for no other rank. Throws
-        // nothing.
+        // end() in any case. Returns false if there was an exception. Throws nothing.
         // `tile` is the tile that body() renders, if any: the error names it, and with FrameConfig::allowPartial the
         // frame goes on without it. Its index is read only after an exception, so body() may set it.
         template <class Body>
@@ -234,12 +228,11 @@ public:
 
         // Makes the frame fail on all ranks, with the text of this exception. `tileIndex`: the tile that the exception
         // concerns, which the error names; or -1. With FrameConfig::allowPartial the frame goes on without that tile.
-        // Any thread. Does nothing after end(). Waits for nothing.
+        // Does nothing after end().
         void abort(const std::exception_ptr& reason, int tileIndex = -1) { engine_->abort(number_, reason, tileIndex); }
 
         // Makes the frame fail on all ranks with ErrorKind::Cancelled, because nobody needs it any more. Call end() all
-        // the same. Tiles that are set later are dropped. Does nothing after end(). Any thread, also during end().
-        // Waits for nothing.
+        // the same. Tiles that are set later are dropped. May be called during end(). Does nothing after it.
         void cancel() const
         {
             const Error reason(detail::errorInfo(ErrorKind::Cancelled, "the frame was cancelled"));

@@ -57,9 +57,9 @@ struct FrameBufferConfig {
     // is exact. Depth, positions and ids always travel exactly; normals and albedo are scaled to the rounded alpha.
     // Finished tiles travel in image.format. All ranks must give the same.
     Precision precision{};
-    // For AlphaBlend, OrderedBlend and DeepBlend. If the layers of a pixel let through less than this fraction of the
-    // light, the layers behind them are left out. The pixel changes by no more than this times the largest colour. 0
-    // (exact) to below 1. All ranks must give the same.
+    // For all operations of the library but DepthComposite. If the layers of a pixel let through less than this
+    // fraction of the light, what is behind them is left out, also the background. The pixel changes by no more than
+    // this times the largest colour. 0 (exact) to below 1. All ranks must give the same.
     float minTransmittance = 0;
     // How many frames may be open at once, 1 or more. Memory grows with it. Operations that keep state allow one. All
     // ranks must give the same.
