@@ -62,12 +62,12 @@ public:
         const std::vector<int>& ownedTiles() const noexcept { return engine_->ownedNow(); }
 
         // Prepares `tile` for a tile and a pass of this frame: clears it, and sets generation 0, no children, this rank
-        // as source, and part 0. A channel that is not sent in this frame is not cleared, such as depth that neither
-        // the operation nor the image needs. Throws InvalidArgument if there is no such tile or pass.
+        // as source, and part 0. Channels beside colour and depth are only cleared if they are sent in this frame.
+        // Throws InvalidArgument if there is no such tile or pass.
         void start(Tile& tile, int tileIndex, int pass = 0) const
         {
             static_cast<TileHeader&>(tile) = engine_->headerOf(tileIndex, pass);
-            tile.clear(engine_->sent());
+            tile.clear(engine_->sent() | depthChannel); // a renderer may compare with the depth that is there
         }
         // Prepares a view. Its planes are null afterwards: point them to your pixels. Throws as above.
         void start(TileView& tile, int tileIndex, int pass = 0) const

@@ -241,7 +241,8 @@ struct Ordered {
         const dfb::SharedWorld world(fb, mine);
         const auto shade = [&](const dfb::Brick& b, int x, int y, float* rgba, float& depth) {
             const float t = enter(b.bounds, eye, camera.direction(x + 0.5, y + 0.5, 97, 61));
-            if (t < 0 || (x + y) % 11 == static_cast<int>(b.id) % 11)
+            const bool isNearest = t < depth; // as renderers of several surfaces ask; a started tile has no surface
+            if (t < 0 || !isNearest || (x + y) % 11 == static_cast<int>(b.id) % 11)
                 return;
             rgba[3] = 0.3f + 0.05f * static_cast<float>(b.id % 5);
             rgba[b.id % 3] = rgba[3] * 0.9f;

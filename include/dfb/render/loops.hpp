@@ -299,8 +299,8 @@ public:
 
     // `all` has the bricks of all ranks, those of `world` among them. It must outlive the loop. If the bricks have an
     // order from front to back for the camera, the loop sets FrameConfig::order: AlphaBlend then sorts nothing, and
-    // depth is neither cleared nor sent unless the image has it. If ranks are on several nodes, tiles belong to ranks
-    // near their pixels: see ImageConfig::ownerMap.
+    // sends depth only if the image has it. If ranks are on several nodes, tiles belong to ranks near their pixels: see
+    // ImageConfig::ownerMap.
     DataParallelLoop(FrameBuffer& fb, const World& world, const SharedWorld& all) : fb_(fb), world_(world), all_(&all)
     {
     }
