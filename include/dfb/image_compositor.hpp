@@ -195,8 +195,8 @@ private:
     std::vector<TileInput> inputs_;
     // Used only if ranks are on several nodes:
     std::optional<detail::LinkOwners> owners_;
-    std::vector<int> ranks_;      // all, ascending
-    std::vector<Figure> regions_; // of the ranks' images in the last picture: see detail::PackedRegion
+    std::vector<double> regions_, nextRegions_; // of each rank's image in the last picture: see detail::PackedRegion
+    TileOwners regionOwners_;                   // by regions_; null: not found yet
 };
 
 DFB_NAMESPACE_END
@@ -386,13 +386,15 @@ DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& conf
     engine_ = detail::makeEngine(connection_, config, *operations, 0);
     operations_ = std::move(operations);
     regions_.clear();
+    regionOwners_ = nullptr;
     if (owners_)
         return;
     owners_.emplace(engine_->nodeOf());
-    for (int rank = 0; rank < size(); ++rank)
-        ranks_.push_back(rank);
-    if (!owners_->isOneNode())
-        makeEngine(config); // with square tiles
+    if (owners_->isOneNode())
+        return;
+    regions_.reserve(static_cast<std::size_t>(size()));
+    nextRegions_.reserve(static_cast<std::size_t>(size()));
+    makeEngine(config); // with square tiles
 }
 
 // Finds owners by the regions of the last picture, because those of this one are not known yet. Returns null if no
@@ -401,18 +403,18 @@ DFB_COMPILED_ONCE TileOwners ImageCompositor::findOwners()
 {
     if (regions_.empty() || config().image.ownerMap)
         return nullptr;
+    if (regionOwners_)
+        return regionOwners_;
     const TileLayout& layout = engine_->layout();
     const detail::PackedRegion packed(layout);
     owners_->start(layout);
-    for (const Figure& figure : regions_) {
-        if (figure.key >= ranks_.size()) // a message can be damaged
-            continue;
-        detail::forEachTile(packed.unpack(figure.value), layout, [&](int tile, const Region& pixels) {
-            owners_->add(tile, pixels, &ranks_[figure.key], 1);
-        });
-    }
-    return owners_->find(config(), blend_ != ImageBlend::InOrder,
-                         [this](int tile) { return engine_->tileOwner(tile); });
+    for (const std::vector<int>& ranks : owners_->byNode())
+        for (const int& rank : ranks)
+            detail::forEachTile(packed.unpack(regions_[static_cast<std::size_t>(rank)]), layout,
+                                [&](int tile, const Region& pixels) { owners_->add(tile, pixels, &rank, 1); });
+    regionOwners_ =
+        owners_->find(config(), blend_ != ImageBlend::InOrder, [this](int tile) { return engine_->tileOwner(tile); });
+    return regionOwners_;
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::resize(int width, int height)
@@ -434,11 +436,19 @@ DFB_COMPILED_ONCE void ImageCompositor::begin(const FrameConfig& frame)
     declared.passes = 1;
     declared.samples = nullptr;
     declared.declared = true;
-    if (!declared.owners)
-        declared.owners = findOwners();
+    std::exception_ptr failure; // end() throws it on all ranks
+    try {
+        if (!declared.owners)
+            declared.owners = findOwners();
+    } catch (...) {
+        failure = std::current_exception();
+    }
     if (declared.maxLayers == 0)
         declared.maxLayers = size();
-    engine_->begin(declared, [] {});
+    engine_->begin(declared, [&] {
+        if (failure)
+            std::rethrow_exception(failure);
+    });
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::startFailed(const std::exception_ptr& why, const FrameConfig& frame)
@@ -482,7 +492,15 @@ DFB_COMPILED_ONCE FrameReport ImageCompositor::end()
         detail::failArgument("end() without start()");
     engine_->requireProgress();
     FrameReport report = engine_->end();
-    regions_ = std::exchange(report.figures, {});
+    const std::vector<Figure> figures = std::exchange(report.figures, {});
+    nextRegions_.assign(figures.empty() ? 0 : static_cast<std::size_t>(size()), -1);
+    for (const Figure& figure : figures)
+        if (figure.key < nextRegions_.size()) // a message can be damaged
+            nextRegions_[figure.key] = figure.value;
+    if (nextRegions_ != regions_) {
+        regions_.swap(nextRegions_);
+        regionOwners_ = nullptr;
+    }
     return report;
 }
 

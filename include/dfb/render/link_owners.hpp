@@ -12,7 +12,6 @@
 #include <algorithm>
 #include <cstddef>
 #include <memory>
-#include <utility>
 #include <vector>
 
 DFB_NAMESPACE_BEGIN
@@ -25,7 +24,8 @@ class LinkOwners {
 public:
     // `nodeOf`: for each rank, the lowest rank of its node.
     explicit LinkOwners(const std::vector<int>& nodeOf)
-        : nodeOf_(nodeOf), ranksOf_(nodeOf.size()), links_(nodeOf.size()), work_(nodeOf.size())
+        : nodeOf_(nodeOf), ranksOf_(nodeOf.size()), links_(nodeOf.size()), fromNode_(nodeOf.size()),
+          work_(nodeOf.size())
     {
         for (std::size_t rank = 0; rank < nodeOf.size(); ++rank)
             ranksOf_[static_cast<std::size_t>(nodeOf[rank])].push_back(static_cast<int>(rank));
@@ -37,28 +37,35 @@ public:
     void start(const TileLayout& layout)
     {
         layout_ = layout;
-        found_.clear();
-        first_.assign(static_cast<std::size_t>(layout.tileCount()) + 1, 0);
+        parts_.clear();
+        tiles_.assign(static_cast<std::size_t>(layout.tileCount()), {});
     }
 
-    // Some pixels of a tile come from one of `rankCount` ranks; nobody knows from which. `ranks` must stay until
-    // find().
+    // Some pixels of a tile come from one of `rankCount` ranks; nobody knows from which. Takes the least memory if the
+    // ranks of a node come one after the other, as in byNode().
     void add(int tile, const Region& pixels, const int* ranks, std::size_t rankCount)
     {
-        found_.push_back({tile, ranks, rankCount, areaOf(pixels)});
-        ++first_[static_cast<std::size_t>(tile) + 1];
+        const double share = areaOf(pixels) / static_cast<double>(rankCount);
+        for (std::size_t i = 0; i < rankCount; ++i)
+            addPart(tiles_[static_cast<std::size_t>(tile)], nodeOf(ranks[i]), share);
     }
+
+    // All ranks, node by node.
+    const std::vector<std::vector<int>>& byNode() const { return ranksOf_; }
 
     // Returns the owner of each tile. `hasDepth`: whether inputs have depth. `elsewhere(tile)` gives the owners of
     // tiles without pixels.
     TileOwners find(const FrameBufferConfig& config, bool hasDepth, FunctionRef<int(int)> elsewhere);
 
 private:
-    struct Part {
-        int tile = 0;
-        const int* ranks = nullptr;
-        std::size_t rankCount = 0;
+    static constexpr int none = -1;
+    struct Part { // the pixels of a tile that come from a node; a node may have several parts
+        int node = 0, next = none;
         double pixels = 0;
+    };
+    struct Tile {
+        int first = none, last = none; // of its parts
+        int node = none;               // of its owner
     };
     struct Link { // the bytes into and out of a node
         double in = 0, out = 0;
@@ -67,67 +74,52 @@ private:
     static double areaOf(const Region& r) { return static_cast<double>(r.width()) * static_cast<double>(r.height()); }
     int nodeOf(int rank) const { return nodeOf_[static_cast<std::size_t>(rank)]; }
     Link& linkOf(int node) { return links_[static_cast<std::size_t>(node)]; }
-    // The parts of a tile.
-    const Part* begin(int tile) const { return parts_.data() + first_[static_cast<std::size_t>(tile)]; }
-    const Part* end(int tile) const { return begin(tile + 1); }
-    bool isAnywhere(int tile) const { return begin(tile) != end(tile); }
+    double& fromNode(int node) { return fromNode_[static_cast<std::size_t>(node)]; }
 
-    void sortByTile();
-
-    void place(int tile);
-
-    void addFrom(int node, double bytes)
+    void addPart(Tile& tile, int node, double pixels)
     {
-        for (auto& [its, sum] : from_)
-            if (its == node) {
-                sum += bytes;
-                return;
-            }
-        from_.emplace_back(node, bytes);
+        if (tile.last != none && part(tile.last).node == node) {
+            part(tile.last).pixels += pixels;
+            return;
+        }
+        const int added = static_cast<int>(parts_.size());
+        parts_.push_back({node, none, pixels});
+        (tile.last == none ? tile.first : part(tile.last).next) = added;
+        tile.last = added;
     }
+    Part& part(int i) { return parts_[static_cast<std::size_t>(i)]; }
 
-    // Calls f(load, bytes) for each load of a link to which the inputs in from_ or the finished tile add bytes, if the
-    // owner is on `node`.
-    template <class F>
-    void forEachLoad(int node, double finished, const F& f)
+    void place(Tile& tile, double area);
+
+    // Adds what the tile in from_ loads the links with, if the owner is on `node`; or, with sign -1, takes it away.
+    void carry(int node, double input, double finished, int sign)
     {
-        double in = 0;
-        for (const auto& [source, bytes] : from_)
-            if (source != node) {
-                f(linkOf(source).out, bytes);
-                in += bytes;
-            }
-        f(linkOf(node).in, in);
+        for (const int source : from_)
+            if (source != node)
+                linkOf(source).out += sign * fromNode(source);
+        linkOf(node).in += sign * (input - fromNode(node));
         if (node != displayNode_) {
-            f(linkOf(node).out, finished);
-            f(linkOf(displayNode_).in, finished);
+            linkOf(node).out += sign * finished;
+            linkOf(displayNode_).in += sign * finished;
         }
     }
-    void carry(int node, double finished, int sign)
-    {
-        forEachLoad(node, finished, [sign](double& load, double bytes) { load += sign * bytes; });
-    }
-    // How much the sum of the squares of all loads grows with an owner on `node`.
-    double costOf(int node, double finished)
-    {
-        double cost = 0;
-        forEachLoad(node, finished, [&](double load, double bytes) { cost += bytes * (2 * load + bytes); });
-        return cost;
-    }
+    // How much the square of a load grows with these bytes.
+    static double growth(double load, double bytes) { return bytes * (2 * load + bytes); }
 
-    int leastBusy(int tile);
+    int leastBusy(const Tile& tile);
 
     std::vector<int> nodeOf_;
     std::vector<std::vector<int>> ranksOf_; // of each node
     TileLayout layout_;
     double inputBytes_ = 0, imageBytes_ = 0; // bytes of a pixel: to the owner, and to the display rank
     int displayNode_ = 0;
-    std::vector<Part> found_, parts_;          // parts_: tile by tile
-    std::vector<std::size_t> first_, next_;    // for each tile, an index into parts_
-    std::vector<std::pair<int, double>> from_; // nodes, and how many bytes of a tile come from each
-    std::vector<Link> links_;                  // of each node
-    std::vector<double> work_;                 // pixels that each rank has to blend
-    std::vector<int> nodes_, owners_;          // of each tile
+    std::vector<Part> parts_;
+    std::vector<Tile> tiles_;
+    std::vector<Link> links_;      // of each node
+    std::vector<int> from_;        // the nodes from which a tile's inputs come, and that of the display rank
+    std::vector<double> fromNode_; // the bytes of these inputs from each node
+    std::vector<double> work_;     // pixels that each rank has to blend
+    std::vector<int> owners_;      // of each tile
     TileOwners last_;
 };
 
@@ -135,70 +127,70 @@ private:
 DFB_COMPILED_ONCE TileOwners LinkOwners::find(const FrameBufferConfig& config, bool hasDepth,
                                               FunctionRef<int(int)> elsewhere)
 {
-    sortByTile();
     const ImageConfig& image = config.image;
     inputBytes_ = 4.0 * static_cast<double>(bytesOf(config.precision.color)) + 4 * (hasDepth || image.depth);
     imageBytes_ = static_cast<double>(bytesPerPixel(image.format)) + 4 * image.depth;
     displayNode_ = nodeOf(image.displayRank);
     std::fill(links_.begin(), links_.end(), Link());
     std::fill(work_.begin(), work_.end(), 0.0);
-    nodes_.assign(static_cast<std::size_t>(layout_.tileCount()), -1);
     for (int sweep = 0; sweep < 2; ++sweep) // the second time, each tile is placed knowing all others
-        for (int tile = 0; tile < layout_.tileCount(); ++tile)
-            if (isAnywhere(tile))
-                place(tile);
+        for (int t = 0; t < layout_.tileCount(); ++t)
+            if (Tile& tile = tiles_[static_cast<std::size_t>(t)]; tile.first != none)
+                place(tile, areaOf(layout_.region(t)));
     owners_.clear();
-    for (int tile = 0; tile < layout_.tileCount(); ++tile)
-        owners_.push_back(isAnywhere(tile) ? leastBusy(tile) : elsewhere(tile));
+    for (int t = 0; t < layout_.tileCount(); ++t) {
+        const Tile& tile = tiles_[static_cast<std::size_t>(t)];
+        owners_.push_back(tile.first != none ? leastBusy(tile) : elsewhere(t));
+    }
     if (!last_ || *last_ != owners_)
         last_ = std::make_shared<const std::vector<int>>(owners_);
     return last_;
 }
 
-DFB_COMPILED_ONCE void LinkOwners::sortByTile()
-{
-    for (std::size_t tile = 1; tile < first_.size(); ++tile)
-        first_[tile] += first_[tile - 1];
-    parts_.resize(found_.size());
-    next_ = first_;
-    for (const Part& part : found_)
-        parts_[next_[static_cast<std::size_t>(part.tile)]++] = part;
-}
-
-// Gives a tile to the node with which the sum of the squares of all links' loads is least. The node has pixels of the
-// tile, or is that of the display rank.
-DFB_COMPILED_ONCE void LinkOwners::place(int tile)
+// Gives a tile of so many pixels to the node with which the sum of the squares of all links' loads is least. The node
+// has pixels of the tile, or is that of the display rank.
+DFB_COMPILED_ONCE void LinkOwners::place(Tile& tile, double area)
 {
     double pixels = 0;
-    from_.clear();
-    addFrom(displayNode_, 0);
-    for (const Part* part = begin(tile); part != end(tile); ++part) {
-        pixels += part->pixels;
-        for (std::size_t i = 0; i < part->rankCount; ++i)
-            addFrom(nodeOf(part->ranks[i]), inputBytes_ * part->pixels / static_cast<double>(part->rankCount));
+    from_.assign(1, displayNode_);
+    for (int i = tile.first; i != none; i = part(i).next) {
+        const auto [node, next, share] = part(i);
+        if (node != displayNode_ && fromNode(node) == 0)
+            from_.push_back(node);
+        fromNode(node) += inputBytes_ * share;
+        pixels += share;
     }
-    const double finished = imageBytes_ * std::min(pixels, areaOf(layout_.region(tile)));
-    int& node = nodes_[static_cast<std::size_t>(tile)];
-    if (node >= 0)
-        carry(node, finished, -1);
-    node = -1;
+    const double input = inputBytes_ * pixels, finished = imageBytes_ * std::min(pixels, area);
+    if (tile.node != none)
+        carry(tile.node, input, finished, -1);
+    double sent = 0; // how much the squares of what nodes send grow if each sends its inputs
+    for (const int source : from_)
+        sent += growth(linkOf(source).out, fromNode(source));
+    tile.node = none;
     double least = 0;
-    for (const auto& from : from_)
-        if (const double cost = costOf(from.first, finished); node < 0 || cost < least) {
-            node = from.first;
+    for (const int node : from_) {
+        const Link& link = linkOf(node);
+        double cost = sent - growth(link.out, fromNode(node)) + growth(link.in, input - fromNode(node));
+        if (node != displayNode_)
+            cost += growth(link.out, finished) + growth(linkOf(displayNode_).in, finished);
+        if (tile.node == none || cost < least) {
+            tile.node = node;
             least = cost;
         }
-    carry(node, finished, 1);
+    }
+    carry(tile.node, input, finished, 1);
+    for (const int node : from_)
+        fromNode(node) = 0;
 }
 
 // Returns the rank on the tile's node that has the fewest pixels to blend.
-DFB_COMPILED_ONCE int LinkOwners::leastBusy(int tile)
+DFB_COMPILED_ONCE int LinkOwners::leastBusy(const Tile& tile)
 {
-    const auto& ranks = ranksOf_[static_cast<std::size_t>(nodes_[static_cast<std::size_t>(tile)])];
+    const auto& ranks = ranksOf_[static_cast<std::size_t>(tile.node)];
     const auto workOf = [this](int rank) -> double& { return work_[static_cast<std::size_t>(rank)]; };
     const int best = *std::min_element(ranks.begin(), ranks.end(), [&](int a, int b) { return workOf(a) < workOf(b); });
-    for (const Part* part = begin(tile); part != end(tile); ++part)
-        workOf(best) += part->pixels;
+    for (int i = tile.first; i != none; i = part(i).next)
+        workOf(best) += part(i).pixels;
     return best;
 }
 #endif

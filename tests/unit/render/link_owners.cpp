@@ -5,7 +5,10 @@
 
 #include <algorithm>
 #include <cstddef>
+#include <limits>
 #include <numeric>
+#include <random>
+#include <utility>
 #include <vector>
 
 namespace {
@@ -77,6 +80,93 @@ TEST_CASE("Ranks of one node share its tiles, and one node needs no owners", "[l
     CHECK(counts == std::vector<int>{17, 17, 16, 25, 25});
     CHECK(LinkOwners({0, 0, 0}).isOneNode());
     CHECK(LinkOwners({0}).isOneNode());
+}
+
+TEST_CASE("The owner of a tile is on the node that makes the links' squares grow least", "[link_owners]")
+{
+    // The greedy rule, written down plainly. Depending on the seed, a node has up to 3 ranks, and ranks have up to all
+    // of the image. Each rank adds its pixels by itself or together with the next one.
+    for (unsigned seed = 0; seed < 40; ++seed) {
+        CAPTURE(seed);
+        std::mt19937 random(seed);
+        const auto below = [&](int end) { return static_cast<int>(random() % static_cast<unsigned>(end)); };
+        const int ranks = 2 + below(9), perNode = 1 + below(3);
+        std::vector<int> nodeOf;
+        for (int rank = 0; rank < ranks; ++rank)
+            nodeOf.push_back(below(2) == 0 ? rank / perNode * perNode : rank % ((ranks + perNode - 1) / perNode));
+        for (int rank = 0; rank < ranks; ++rank) // the number of a node is that of its lowest rank
+            nodeOf[static_cast<std::size_t>(rank)] = static_cast<int>(
+                std::find(nodeOf.begin(), nodeOf.end(), nodeOf[static_cast<std::size_t>(rank)]) - nodeOf.begin());
+        const dfb::TileLayout layout(80, 64, 16);
+        const auto tiles = static_cast<std::size_t>(layout.tileCount());
+        std::vector<std::vector<double>> pixels(tiles, std::vector<double>(static_cast<std::size_t>(ranks)));
+        std::vector<int> all(static_cast<std::size_t>(ranks));
+        std::iota(all.begin(), all.end(), 0);
+        LinkOwners links(nodeOf);
+        links.start(layout);
+        for (int rank = 0; rank < ranks; ++rank) {
+            const int x0 = below(80), y0 = below(64), both = rank + 1 < ranks ? 1 + below(2) : 1;
+            const dfb::Region part{x0, y0, x0 + 1 + below(80 - x0), y0 + 1 + below(64 - y0)};
+            for (std::size_t t = 0; t < tiles; ++t) {
+                const dfb::Region r = dfb::intersection(layout.region(static_cast<int>(t)), part);
+                if (r.empty())
+                    continue;
+                links.add(static_cast<int>(t), r, &all[static_cast<std::size_t>(rank)], static_cast<std::size_t>(both));
+                for (int i = 0; i < both; ++i)
+                    pixels[t][static_cast<std::size_t>(rank + i)] += double(r.width()) * r.height() / both;
+            }
+        }
+        dfb::FrameBufferConfig config(80, 64);
+        config.image.displayRank = below(ranks);
+        const int display = nodeOf[static_cast<std::size_t>(config.image.displayRank)];
+        std::vector<double> in(nodeOf.size()), out(nodeOf.size());
+        const auto carry = [&](std::size_t t, int node, double sign) {
+            double sum = 0;
+            for (std::size_t rank = 0; rank < nodeOf.size(); ++rank) {
+                sum += pixels[t][rank];
+                if (nodeOf[rank] != node) {
+                    out[static_cast<std::size_t>(nodeOf[rank])] += sign * 16 * pixels[t][rank];
+                    in[static_cast<std::size_t>(node)] += sign * 16 * pixels[t][rank];
+                }
+            }
+            if (node != display) {
+                const double finished = 4 * std::min(sum, 256.0);
+                out[static_cast<std::size_t>(node)] += sign * finished;
+                in[static_cast<std::size_t>(display)] += sign * finished;
+            }
+        };
+        const auto squares = [&] {
+            return std::inner_product(in.begin(), in.end(), in.begin(), 0.0)
+                   + std::inner_product(out.begin(), out.end(), out.begin(), 0.0);
+        };
+        const std::vector<int> owners = *links.find(config, false, [](int) { return -1; });
+        std::vector<int> placed(tiles, -1);
+        for (const bool isSecond : {false, true})
+            for (std::size_t t = 0; t < tiles; ++t) {
+                const double sum = std::accumulate(pixels[t].begin(), pixels[t].end(), 0.0);
+                if (sum == 0)
+                    continue;
+                if (isSecond)
+                    carry(t, placed[t], -1);
+                // Of nodes that are as good, the first is taken: that of the display rank, then by rank.
+                std::vector<int> nodes{display};
+                for (std::size_t rank = 0; rank < nodeOf.size(); ++rank)
+                    if (pixels[t][rank] > 0)
+                        nodes.push_back(nodeOf[rank]);
+                double least = std::numeric_limits<double>::infinity();
+                for (const int node : nodes) {
+                    carry(t, node, 1);
+                    if (const double cost = squares(); cost < least) {
+                        placed[t] = node;
+                        least = cost;
+                    }
+                    carry(t, node, -1);
+                }
+                carry(t, placed[t], 1);
+            }
+        for (std::size_t t = 0; t < tiles; ++t)
+            CHECK((owners[t] < 0 ? -1 : nodeOf[static_cast<std::size_t>(owners[t])]) == placed[t]);
+    }
 }
 
 TEST_CASE("No link has much more to carry than the others", "[link_owners]")
