@@ -384,16 +384,17 @@ public:
     {
         Engine& engine = *engines_[next_];
         engine.begin(params, [&] {
+            operations_[next_]->newFrame(tileData, pixelData); // also in a frame that fails: a wall counts frames
             if (failure)
                 std::rethrow_exception(failure);
-            operations_[next_]->newFrame(tileData, pixelData);
         });
         next_ = (next_ + 1) % engines_.size();
         return Frame(this, &engine);
     }
 
     // Changes the size of the image, in pixels. Afterwards image() is empty, tile operations are made anew and have
-    // lost what they kept, and frames are numbered from 1 again. Collective, outside frames. Waits for all ranks.
+    // lost what they kept, and frames are numbered from 1 again. A Frame of before must not be used any more, not even
+    // to cancel it. Collective, outside frames. Waits for all ranks.
     // Throws InvalidArgument, with nothing changed: on this rank if a frame is open, on all ranks if the size is not 1
     // to 65536 or differs between ranks, or if memory is short. Throws TransportError.
     void resize(int width, int height)

@@ -6,7 +6,9 @@
 #include <algorithm>
 #include <chrono>
 #include <cstring>
+#include <exception>
 #include <memory>
+#include <stdexcept>
 #include <utility>
 
 namespace frame_cases {
@@ -84,16 +86,16 @@ struct Wall {
             return params;
         };
         const auto data = [&](auto& fb, int frame) {
-            const scene::Scene s =
-                scene::makeScene(3, static_cast<std::uint64_t>(frame + 4), fb.config().image.width, fb.config().image.height);
+            const scene::Scene s = scene::makeScene(3, static_cast<std::uint64_t>(frame + 4), fb.config().image.width,
+                                                    fb.config().image.height);
             return dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
                 .render(
                     scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); },
                     paramsOfFrame(frame));
         };
         const auto image = [&](auto& fb, int frame) {
-            const scene::Scene s =
-                scene::makeScene(1, static_cast<std::uint64_t>(frame + 2), fb.config().image.width, fb.config().image.height);
+            const scene::Scene s = scene::makeScene(1, static_cast<std::uint64_t>(frame + 2), fb.config().image.width,
+                                                    fb.config().image.height);
             return dfb::ImageParallelLoop(fb, dfb::WorkDistribution::RoundRobin)
                 .render([&](auto& tile) { renderBrick(s, s.bricks[0], tile); }, paramsOfFrame(frame));
         };
@@ -192,22 +194,25 @@ struct WallSkips {
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         config.image.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
         FrameBufferOf<dfb::BasicImageParallel<16>, dfb::ToWall, Transport> fb(connection, config, {&wall});
+        const auto reason = std::make_exception_ptr(std::runtime_error("a camera"));
         const auto show = [&](float shade) {
             dfb::FrameConfig params;
             params.background = {shade, shade, shade, 1};
             return dfb::ImageParallelLoop(fb).render([](auto&) {}, params).frame;
         };
-        for (const bool isCancelled : {true, false}) {
+        enum { Cancelled, NotBegunWell, NotFinished };
+        for (const int how : {Cancelled, NotBegunWell, NotFinished}) {
             for (int i = 0; i < 20; ++i) {
-                if (!isCancelled) {
+                if (how == NotFinished) {
                     show(0.125f);
                     continue;
                 }
-                auto frame = fb.begin();
-                frame.cancel();
+                auto frame = fb.begin({}, {}, {}, how == NotBegunWell ? reason : nullptr);
+                if (how == Cancelled)
+                    frame.cancel();
                 scene::outcomeOf([&] { frame.end(); });
             }
-            const float shade = isCancelled ? 0.5f : 0.25f;
+            const float shade = 0.25f * static_cast<float>(how + 1);
             const std::int64_t number = show(shade);
             const std::string outcome = scene::outcomeOf([&] { wall.finish(number); });
             result.expect(outcome == "fine", "after 20 frames: " + outcome);

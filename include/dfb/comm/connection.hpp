@@ -19,6 +19,7 @@
 #include <limits>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <optional>
 #include <string>
 #include <thread>
@@ -559,8 +560,13 @@ private:
     std::weak_ptr<const void> thrownByAll_; // under failureMutex_
     std::atomic<bool> failed_{false};
 
-    ProgressThread progress_{*link_, longestNap(),
-                             [this](Clock::time_point now) { beat(now, progress_.expectsMessages()); }};
+    ProgressThread progress_{*link_, longestNap(), [this](Clock::time_point now) {
+                                 try {
+                                     beat(now, progress_.expectsMessages());
+                                 } catch (const std::bad_alloc& e) { // the thread has nobody to tell
+                                     fail(detail::errorInfo(ErrorKind::Transport, e.what(), rank()));
+                                 }
+                             }};
 };
 
 // Connects the ranks of a communicator, for framebuffers, compositors and walls that share the connection. Collective,

@@ -438,7 +438,7 @@ public:
         Bytes mine = partOf(call); // then, for each rank: its number, the size, the bytes
         mine.put(static_cast<std::int32_t>(rank()));
         mine.put(static_cast<std::uint64_t>(own.size()));
-        mine.append(own.data(), own.data() + own.size());
+        takeMemory([&] { mine.append(own.data(), own.data() + own.size()); });
         const auto combine = [](ByteReader& a, ByteReader& b, Bytes& out) {
             a.copyTo(out);
             b.copyTo(out);
@@ -454,6 +454,19 @@ public:
             }
         });
         return result;
+    }
+
+    // Calls make(), which makes this rank's part of a collective call. If it lacks memory, the connection fails on all
+    // ranks, as the others would wait for the part; and this throws std::bad_alloc.
+    template <class Make>
+    void takeMemory(const Make& make)
+    {
+        try {
+            make();
+        } catch (const std::bad_alloc& e) {
+            giveUp(-1, errorInfo(ErrorKind::Transport, e.what()));
+            throw;
+        }
     }
 
 private:

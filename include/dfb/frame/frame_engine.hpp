@@ -352,8 +352,10 @@ public:
     Image imageOnAllRanks(Engine& gatherer) override
     {
         std::vector<std::byte> mine;
-        image().forEachPlane(
-            [&](const std::byte* bytes, std::size_t count) { mine.insert(mine.end(), bytes, bytes + count); });
+        mailbox_->takeMemory([&] {
+            image().forEachPlane(
+                [&](const std::byte* bytes, std::size_t count) { mine.insert(mine.end(), bytes, bytes + count); });
+        });
         const auto all = gatherer.allGather(mine, "imageOnAllRanks()");
         const std::vector<std::byte>& displayed = all[static_cast<std::size_t>(config_.image.displayRank)];
         if (displayed.empty())
@@ -417,10 +419,13 @@ private:
         const auto expected = std::count_if(tiles.begin(), tiles.end(), [&](int tile) {
             return isKept(tile) || (!params_.declared && samples(tile).count > 0);
         });
+        std::optional<ErrorInfo> failure;
+        if (userError)
+            failure = errorInfoOf(userError, {});
         auto& early = open_.open();
+        if (failure) // first of all: end() throws it on all ranks, and nothing is made with half of the frame's data
+            outcome_->failWhole(*failure);
         open_.expectTiles(expected);
-        if (userError) // end() throws it on all ranks; nothing is made with half of the frame's data
-            outcome_->failWhole(errorInfoOf(userError, {}));
         for (Arrival& a : early)
             incoming(a.source, a.header, std::move(a.message));
         early.clear(); // if the frame has failed, some have not been taken

@@ -680,7 +680,8 @@ TEST_CASE("A lack of memory for finished tiles costs a partial frame no other ti
 
 TEST_CASE("A rank that lacks memory to combine parts of a reduction ends it on every rank", "[counters]")
 {
-    const bool isLate = GENERATE(false, true); // true: rank 0 combines in the call itself, not in a task
+    // Where rank 0 lacks memory: in a task that combines, in the call, which combines; in the call, for its own part.
+    const std::string where = GENERATE(as<std::string>(), "task", "call", "own part");
     std::vector<std::string> texts(2);
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         const auto executor = std::make_shared<dfb::CallerExecutor>();
@@ -688,10 +689,11 @@ TEST_CASE("A rank that lacks memory to combine parts of a reduction ends it on e
         config.executor = executor;
         OneTile fb(communicator, config);
         std::string& text = texts[static_cast<std::size_t>(fb.rank())];
-        const std::vector<std::byte> mine(fb.rank() == 0 ? 1000000 : 1000); // together too many
+        // Together too many, or else those of rank 0 alone.
+        const std::vector<std::byte> mine(fb.rank() != 0 ? 1000 : where == "own part" ? 2000000 : 1000000);
         fb.allReduce({0}, OneTile::Reduce::Sum);
         largestAllocation = 1500000;
-        while (isLate && fb.rank() == 0 && !executor->help()) // until the part of rank 1 is here
+        while (where == "call" && fb.rank() == 0 && !executor->help()) // until the part of rank 1 is here
             std::this_thread::yield();
         try {
             fb.allGather(mine);
@@ -703,7 +705,7 @@ TEST_CASE("A rank that lacks memory to combine parts of a reduction ends it on e
     });
     largestAllocation = std::numeric_limits<std::size_t>::max();
     INFO(texts[0] << "; " << texts[1]);
-    CHECK((isLate ? texts[0] == "no memory" : texts[0] == texts[1]));
+    CHECK((where != "task" ? texts[0] == "no memory" : texts[0] == texts[1]));
     CHECK(texts[1].find("rank 0") != std::string::npos);
     CHECK(texts[1].find(std::bad_alloc().what()) != std::string::npos);
 }
