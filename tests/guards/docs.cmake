@@ -1,5 +1,5 @@
 # Run with: cmake -DROOT=<source dir> -P docs.cmake
-# Checks that docs/configuration.md has exactly the fields of each configuration, that links in README and docs are
+# Checks that docs/configuration.md has exactly the fields of each configuration, that links in all texts are
 # valid, that the README is short, and that every copy of the version equals that in dfb/version.hpp.
 cmake_minimum_required(VERSION 3.16)
 file(READ ${ROOT}/docs/configuration.md page)
@@ -49,7 +49,7 @@ if(count LESS 31)
   message(SEND_ERROR "only ${count} fields found: has the form of the headers changed?")
 endif()
 
-file(GLOB pages ${ROOT}/*.md ${ROOT}/docs/*.md ${ROOT}/bench/*.md)
+file(GLOB pages ${ROOT}/*.md ${ROOT}/docs/*.md ${ROOT}/bench/*.md ${ROOT}/examples/adapters/*/*.md)
 foreach(page IN LISTS pages)
   get_filename_component(folder ${page} DIRECTORY)
   file(READ ${page} text)
