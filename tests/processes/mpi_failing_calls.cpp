@@ -191,8 +191,8 @@ int main(int argc, char** argv)
                 params.declared = true;
                 auto frame = fb.begin(params);
                 frame.declare({});
-                if (mpi.rank() == 0)
-                    failing = f.what; // the other rank is told
+                if (i == 0 && mpi.rank() == 0) // once, else the message that tells the others could fail, too
+                    failing = f.what;
                 frame.end();
             }
         });

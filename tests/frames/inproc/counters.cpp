@@ -683,6 +683,7 @@ TEST_CASE("A rank that lacks memory to combine parts of a reduction ends it on e
     // Where rank 0 lacks memory: in a task that combines, in the call, which combines; in the call, for its own part.
     const std::string where = GENERATE(as<std::string>(), "task", "call", "own part");
     std::vector<std::string> texts(2);
+    std::atomic<int> here{0};
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         const auto executor = std::make_shared<dfb::CallerExecutor>();
         dfb::FrameBufferConfig config(64, 64, dfb::OutputFormat::RGBA32F);
@@ -692,6 +693,8 @@ TEST_CASE("A rank that lacks memory to combine parts of a reduction ends it on e
         // Together too many, or else those of rank 0 alone.
         const std::vector<std::byte> mine(fb.rank() != 0 ? 1000 : where == "own part" ? 2000000 : 1000000);
         fb.allReduce({0}, OneTile::Reduce::Sum);
+        for (++here; here < 2;) // else rank 1 may still be in that call when rank 0 has failed
+            std::this_thread::yield();
         largestAllocation = 1500000;
         while (where == "call" && fb.rank() == 0 && !executor->help()) // until the part of rank 1 is here
             std::this_thread::yield();
