@@ -195,8 +195,9 @@ private:
     std::vector<TileInput> inputs_;
     // Used only if ranks are on several nodes:
     std::optional<detail::LinkOwners> owners_;
-    std::vector<double> regions_, nextRegions_; // of each rank's image in the last picture: see detail::PackedRegion
-    TileOwners regionOwners_;                   // by regions_; null: not found yet
+    // Of each rank's image in the last picture, as detail::PackedRegion has it; -1: it had none.
+    std::vector<double> regions_, nextRegions_;
+    TileOwners regionOwners_; // by regions_; null: not found yet
 };
 
 DFB_NAMESPACE_END

@@ -393,17 +393,16 @@ public:
         checkLeft();
         const Connection::Expecting expecting(*connection_);
         try {
-            reductions_.enter({ownScope, number}, std::move(own), std::move(combine),
-                              [this, result](const Bytes& bytes) {
-                                  result->bytes = bytes;
-                                  result->there = true;
-                                  notify();
-                              });
+            makePart([&] {
+                reductions_.enter({ownScope, number}, std::move(own), std::move(combine),
+                                  [this, result](const Bytes& bytes) {
+                                      result->bytes = bytes;
+                                      result->there = true;
+                                      notify();
+                                  });
+            });
         } catch (const Error& e) { // an earlier message of a rank below in the tree is malformed
             giveUp(-1, e.info());
-        } catch (const std::bad_alloc& e) { // the others would wait for this rank's part
-            giveUp(-1, errorInfo(ErrorKind::Transport, e.what()));
-            throw;
         }
         waitForResult([&] { return result->there.load(); }, number == 0, std::move(damage));
         return result->bytes;
@@ -438,7 +437,7 @@ public:
         Bytes mine = partOf(call); // then, for each rank: its number, the size, the bytes
         mine.put(static_cast<std::int32_t>(rank()));
         mine.put(static_cast<std::uint64_t>(own.size()));
-        takeMemory([&] { mine.append(own.data(), own.data() + own.size()); });
+        makePart([&] { mine.append(own.data(), own.data() + own.size()); });
         const auto combine = [](ByteReader& a, ByteReader& b, Bytes& out) {
             a.copyTo(out);
             b.copyTo(out);
@@ -456,10 +455,10 @@ public:
         return result;
     }
 
-    // Calls make(), which makes this rank's part of a collective call. If it lacks memory, the connection fails on all
-    // ranks, as the others would wait for the part; and this throws std::bad_alloc.
+    // Calls make(), which makes or adds this rank's part of a collective call. If it lacks memory, the connection fails
+    // on all ranks, as the others would wait for the part; and this throws std::bad_alloc.
     template <class Make>
-    void takeMemory(const Make& make)
+    void makePart(const Make& make)
     {
         try {
             make();

@@ -352,7 +352,7 @@ public:
     Image imageOnAllRanks(Engine& gatherer) override
     {
         std::vector<std::byte> mine;
-        mailbox_->takeMemory([&] {
+        mailbox_->makePart([&] {
             image().forEachPlane(
                 [&](const std::byte* bytes, std::size_t count) { mine.insert(mine.end(), bytes, bytes + count); });
         });
