@@ -4,6 +4,7 @@
 // is Usher et al., "Scalable Ray Tracing Using the Distributed FrameBuffer", 2019; this is its section 3.
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/engine.hpp>
 #include <dfb/fwd.hpp>
@@ -15,7 +16,6 @@
 #include <cstdio>
 #include <cstdlib>
 #include <exception>
-#include <functional>
 #include <memory>
 #include <optional>
 #include <utility>
@@ -127,7 +127,7 @@ public:
         // mayHide() or show() of another rank. It may call isHidden(), isUndecided() and failed() only, as a lock is
         // held. Runs tasks of the executor meanwhile. One thread at a time may call it; with Progress::Caller, it must
         // be one that may call MPI. If the transport fails, it returns true or throws TransportError.
-        bool waitForWord(const std::function<bool()>& heard) const { return engine_->waitForWord(heard); }
+        bool waitForWord(detail::FunctionRef<bool()> heard) const { return engine_->waitForWord(heard); }
 
         // Declares inputs of generation 1. They must then come in each pass; one without pixels costs a header. Each is
         // declared by one rank, which need not be the one that sends it. In a frame with FrameConfig::declared every
@@ -272,9 +272,6 @@ public:
 
     private:
         friend class DistributedFrameBuffer;
-        struct Leave {
-            void operator()(Engine* engine) const noexcept { engine->leave(); }
-        };
         Frame(DistributedFrameBuffer* fb, Engine* engine)
             : fb_(fb), engine_(engine), number_(engine->frame()), open_(engine)
         {
@@ -289,7 +286,7 @@ public:
         DistributedFrameBuffer* fb_;
         Engine* engine_;
         std::int64_t number_;
-        std::unique_ptr<Engine, Leave> open_; // engine_, until this Frame has ended or was moved from
+        std::unique_ptr<Engine, detail::LeaveFrame> open_; // engine_, until this Frame has ended or was moved from
     };
 
     // Makes a connection over the communicator and a framebuffer on it. Collective. Waits for all ranks. Throws
@@ -315,7 +312,7 @@ public:
         if (!config.executor)
             config.executor = detail::makeThreads(*connection_);
         for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
-            operations_.push_back(std::make_unique<Operations>(pixelOp));
+            operations_.push_back(std::unique_ptr<detail::Operations>(new Operations(pixelOp)));
         makeEngines(config);
     }
 
@@ -384,7 +381,8 @@ public:
     {
         Engine& engine = *engines_[next_];
         engine.begin(params, [&] {
-            operations_[next_]->newFrame(tileData, pixelData); // also in a frame that fails: a wall counts frames
+            // Also in a frame that fails: a wall counts frames.
+            static_cast<Operations&>(*operations_[next_]).newFrame(tileData, pixelData);
             if (failure)
                 std::rethrow_exception(failure);
         });
@@ -457,7 +455,7 @@ private:
 
     std::shared_ptr<Connection> connection_;
     // Each pair of one of these and one of engines_ has one frame at a time. The pairs take turns.
-    std::vector<std::unique_ptr<Operations>> operations_;
+    std::vector<std::unique_ptr<detail::Operations>> operations_;
     std::vector<std::unique_ptr<Engine>> engines_;
     std::size_t next_ = 0;
     Engine* lastEnded_ = nullptr;

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/base/fifo.hpp>
+#include <dfb/base/function_ref.hpp>
 #include <dfb/base/processors.hpp>
 #include <dfb/version.hpp>
 
@@ -68,7 +69,7 @@ public:
     // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Any thread may call it,
     // several at once. Waits until all these calls have returned. On a worker of a ThreadExecutor, that thread alone
     // runs the loop. Rethrows the first exception of a body; after it no other body begins.
-    void parallelFor(std::size_t count, const std::function<void(std::size_t)>& body)
+    void parallelFor(std::size_t count, detail::FunctionRef<void(std::size_t)> body)
     {
         if (count == 0)
             return;

@@ -26,7 +26,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <exception>
-#include <functional>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -552,7 +551,7 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place)
         static thread_local detail::InputTile::Converted converted; // keeps its memory from tile to tile
         engine_->setTile(part.find(view, converted));
     };
-    config().executor->parallelFor(inputs_.size(), std::cref(sendTile)); // copied, it would need memory
+    config().executor->parallelFor(inputs_.size(), sendTile);
 }
 
 DFB_NAMESPACE_END

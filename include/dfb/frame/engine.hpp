@@ -73,6 +73,11 @@ public:
     virtual void leave() noexcept = 0; // in place of end(), when an exception passes
 };
 
+// Of a unique_ptr to an engine whose frame is open.
+struct LeaveFrame {
+    void operator()(Engine* engine) const noexcept { engine->leave(); }
+};
+
 // Collective. `operations` must live as long as the engine; `slot`: which of config.framesInFlight engines this is.
 // Throws as the constructor of DistributedFrameBuffer does.
 DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,

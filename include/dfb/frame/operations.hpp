@@ -96,7 +96,7 @@ public:
             pixelOp_.newFrame(pixelData);
     }
 
-    std::unique_ptr<TileStage> makeTile() const override { return std::make_unique<Stage>(tileData_); }
+    std::unique_ptr<TileStage> makeTile() const override { return std::unique_ptr<TileStage>(new Stage(tileData_)); }
 
     bool opaqueHides([[maybe_unused]] const TileInfo& info) const override
     {
