@@ -137,7 +137,7 @@ endif()
 # warnings under stricter flags.
 add_executable(test_odr guards/odr/first.cpp guards/odr/second.cpp)
 target_link_libraries(test_odr PRIVATE dfb_developer_headers)
-target_compile_options(test_odr PRIVATE -Wconversion)
+target_compile_options(test_odr PRIVATE -Wconversion -O0)
 add_test(NAME guard.odr COMMAND test_odr)
 set_tests_properties(guard.odr PROPERTIES LABELS guard)
 
