@@ -1,11 +1,12 @@
 // Runs a fuzz target without libFuzzer:
 //
 //   test_fuzz_TARGET FILE_OR_FOLDER... [--mutations N] [--seed S]
-//       runs these inputs, and N mutations of them, which are the same for the same S
+//       runs these inputs, and N mutations of them (see repeats()), which are the same for the same S
 //   test_fuzz_TARGET --write-seeds FOLDER
 //       writes the seeds of the target
 //
 // If a run crashes, its input is left in crash-input.
+#include "../support/brief.hpp"
 #include "fuzz.hpp"
 
 #include <csignal>
@@ -160,10 +161,11 @@ int writeSeeds(const std::filesystem::path& folder)
 int runAll(const std::vector<std::string>& arguments)
 {
     std::vector<std::filesystem::path> files;
-    unsigned long long mutations = 0, seed = 1;
+    int mutations = 0;
+    unsigned long long seed = 1;
     for (std::size_t i = 0; i < arguments.size(); ++i) {
         if (arguments[i] == "--mutations")
-            mutations = std::stoull(arguments.at(++i));
+            mutations = repeats(std::stoi(arguments.at(++i)));
         else if (arguments[i] == "--seed")
             seed = std::stoull(arguments.at(++i));
         else if (arguments[i] == "--write-seeds")
@@ -189,12 +191,12 @@ int runAll(const std::vector<std::string>& arguments)
         return 1;
     }
     Random random(seed);
-    for (unsigned long long i = 0; i < mutations; ++i) {
+    for (int i = 0; i < mutations; ++i) {
         std::string input = corpus[below(random, corpus.size())];
         mutate(input, corpus, random);
         run(input);
     }
-    std::printf("fuzz: %zu kept inputs, %llu made of them\n", corpus.size(), mutations);
+    std::printf("fuzz: %zu kept inputs, %d made of them\n", corpus.size(), mutations);
     return 0;
 }
 

@@ -1,25 +1,11 @@
-// Runs the cases of everywhere.hpp on 1, 2, 3, 4 and 7 ranks in this process, or on the numbers of ranks that the
-// environment's DFB_TEST_RANKS names, such as "1 4".
+// Runs the cases of everywhere.hpp on 1, 2, 3, 4 and 7 ranks in this process; in brief, on 1 and 4.
+#include "brief.hpp"
 #include "everywhere.hpp"
 #include "undisturbed.hpp"
 
 #include <cstddef>
-#include <cstdlib>
 #include <future>
-#include <iterator>
-#include <sstream>
 #include <vector>
-
-namespace {
-
-std::vector<int> rankCounts()
-{
-    const char* chosen = std::getenv("DFB_TEST_RANKS");
-    std::istringstream text(chosen ? chosen : "1 2 3 4 7");
-    return {std::istream_iterator<int>(text), {}};
-}
-
-} // namespace
 
 void frame_cases::runEverywhere(Run run, bool atOnce)
 {
@@ -28,8 +14,7 @@ void frame_cases::runEverywhere(Run run, bool atOnce)
     atOnce = false; // with it, a case that mostly waits mostly computes instead
 #endif
 #endif
-    const std::vector<int> counts = rankCounts();
-    REQUIRE(!counts.empty());
+    const std::vector<int> counts = isBrief() ? std::vector<int>{1, 4} : std::vector<int>{1, 2, 3, 4, 7};
     const auto again = [](bool stoodStill, const auto& result) { return stoodStill && !result.get().wrong.empty(); };
     std::vector<std::future<Result>> results;
     for (const int ranks : counts)

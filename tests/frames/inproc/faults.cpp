@@ -1,5 +1,6 @@
 // Frames over a transport that reorders, delays, repeats, loses and damages messages. Each must end in the right image
 // or in an error of dfb. Ranks are threads.
+#include "brief.hpp"
 #include "catch.hpp"
 #include "fault_frames.hpp"
 
@@ -110,7 +111,7 @@ void check(const Tally& tally, int frames)
 
 TEST_CASE("Disturbed frames end in the right image or in an error of dfb", "[faults]")
 {
-    check(faultGroups(1, 2000), 2000);
+    check(faultGroups(1, repeats(2000)), repeats(2000));
 }
 
 TEST_CASE("Many more disturbed frames", "[faults][.stress]") { check(faultGroups(100000, 40000), 40000); }

@@ -1,4 +1,5 @@
 // BackgroundPixels: pixels of a tile that show the background already are written again only if they must be.
+#include "brief.hpp"
 #include "catch.hpp"
 
 #include <dfb/blend/background_pixels.hpp>
@@ -20,8 +21,8 @@ TEST_CASE("Of pixels that become background those are written that are not", "[b
         std::vector<bool> known(static_cast<std::size_t>(width * height), false);
         dfb::detail::BackgroundPixels pixels;
         pixels.newFrame(width, height, 7);
-        std::size_t writes = 0;
-        for (int round = 0; round < 3000; ++round) {
+        int writes = 0;
+        for (int round = 0; round < repeats(3000); ++round) {
             const int y = static_cast<int>(random() % height), x = static_cast<int>(random() % unsigned(width));
             const int count = static_cast<int>(random() % unsigned(width - x + 1));
             const auto at = known.begin() + y * width;
@@ -40,7 +41,7 @@ TEST_CASE("Of pixels that become background those are written that are not", "[b
             });
             REQUIRE(std::all_of(at + x, at + x + count, [](bool b) { return b; }));
         }
-        CHECK(writes > 100);
+        CHECK(writes > repeats(100));
     }
 }
 

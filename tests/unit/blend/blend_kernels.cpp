@@ -1,5 +1,6 @@
 // The kernels of blending and sorting. Vectorised ones equal those in plain C++, bit for bit, and what is built of them
 // equals over(), layer by layer and pixel by pixel.
+#include "brief.hpp"
 #include "catch.hpp"
 
 #include <dfb/blend/compositing.hpp>
@@ -90,7 +91,7 @@ TEST_CASE("Blending a group of layers by hand gives the bits of plain C++", "[ke
 {
     Random random(3);
     int different = 0;
-    for (int round = 0; round < 2000; ++round) {
+    for (int round = 0; round < repeats(2000); ++round) {
         const int width = anyCount(random);
         const Kind kind = kinds[round % 4];
         const Stack stack(random, kind, 1 + static_cast<int>(below(random, d::BlendGroup::mostLayers)), width);
@@ -126,7 +127,7 @@ TEST_CASE("Full rows in place: with AVX2 and AVX-512 as in plain C++", "[kernels
 {
     Random random(11);
     int different = 0, used = 0;
-    for (int round = 0; d::cpuHasAvx2() && round < 4000; ++round) {
+    for (int round = 0; d::cpuHasAvx2() && round < repeats(4000); ++round) {
         const int width = 3 + anyCount(random) + (round % 50 == 0 ? 256 : 0);
         const Stack stack(random, kinds[round % 4], 1 + static_cast<int>(below(random, d::mostInPlace)), width);
         if (round % 3 == 0) // four empty pixels
@@ -171,7 +172,7 @@ TEST_CASE("Full rows in place: with AVX2 and AVX-512 as in plain C++", "[kernels
             check(least > 0 ? d::blendFullRowsAvx512<true> : d::blendFullRowsAvx512<false>);
     }
     CHECK(different == 0);
-    CHECK((used > 1000 || !d::cpuHasAvx2()));
+    CHECK((used > repeats(1000) || !d::cpuHasAvx2()));
 }
 #endif
 
@@ -179,7 +180,7 @@ TEST_CASE("A constant under pixels, and the nearest depths: by hand as in plain 
 {
     Random random(9);
     int different = 0;
-    for (int round = 0; round < 1000; ++round) {
+    for (int round = 0; round < repeats(1000); ++round) {
         const int width = anyCount(random);
         const Stack stack(random, kinds[round % 4], 2, width);
         std::vector<double> rgba(stack.colors[0].end() - 4 * width, stack.colors[0].end()), plain = rgba, transmittance;
@@ -223,7 +224,7 @@ TEST_CASE("Layers in order are what over() makes of them one by one", "[kernels]
     Random random(4);
     int different = 0;
     std::vector<int> scratch;
-    for (int round = 0; round < 1500; ++round) {
+    for (int round = 0; round < repeats(1500); ++round) {
         const int width = anyCount(random), x = static_cast<int>(below(random, 9));
         const Stack stack(random, kinds[round % 3], anyCount(random), width); // all is finite
         dfb::CompositeRow row, expected;
@@ -250,7 +251,7 @@ TEST_CASE("How far an order of depths holds: by hand as in plain C++", "[kernels
 {
     Random random(5);
     int different = 0;
-    for (int round = 0; round < 4000; ++round) {
+    for (int round = 0; round < repeats(4000); ++round) {
         const int width = anyCount(random), begin = static_cast<int>(below(random, static_cast<std::size_t>(width)));
         const Stack stack(random, Kind::Any, 2 + static_cast<int>(below(random, 15)), width);
         d::OrderedDepths order;
@@ -284,7 +285,7 @@ TEST_CASE("Four pixels are sorted by depth, then index, by hand as in plain C++"
     Random random(6);
     int different = 0;
     for (int n = 1; n <= d::SortNetwork::mostLayers; ++n)
-        for (int round = 0; round < 40; ++round) {
+        for (int round = 0; round < repeats(40); ++round) {
             const Stack stack(random, Kind::Any, n, 4);
             std::vector<const float*> depths;
             for (const dfb::Layer& layer : stack.layers)
@@ -317,7 +318,7 @@ TEST_CASE("Blending four pixels with an order each: by hand as in plain C++", "[
 {
     Random random(7);
     int different = 0;
-    for (int round = 0; round < 1000; ++round) {
+    for (int round = 0; round < repeats(1000); ++round) {
         const int n = anyCount(random);
         const Stack stack(random, kinds[round % 4], n, 4);
         std::vector<const float*> colors, depths;
@@ -342,7 +343,7 @@ TEST_CASE("Layers that are sorted are what over() makes of them one by one, pixe
     Random random(8);
     int different = 0;
     std::vector<int> scratch;
-    for (int round = 0; round < 3000; ++round) {
+    for (int round = 0; round < repeats(3000); ++round) {
         const int width = anyCount(random), x = static_cast<int>(below(random, 9));
         const int layerCount = round % 100 == 0 ? 150 : anyCount(random); // more than a network sorts, too
         const Stack stack(random, kinds[round % 3], layerCount, width);

@@ -1,4 +1,5 @@
 // FragmentCompositor: rows of fragments in order equal a fold of each pixel by itself.
+#include "brief.hpp"
 #include "catch.hpp"
 
 #include <dfb/blend/fragment_compositor.hpp>
@@ -142,7 +143,7 @@ struct Stack {
 TEST_CASE("Fragments in order are folded pixel by pixel, in long runs and in short ones", "[compositing]")
 {
     std::mt19937 random(11);
-    for (int round = 0; round < 60; ++round) {
+    for (int round = 0; round < repeats(60); ++round) {
         const unsigned span = round % 3 == 0 ? 4 : round % 3 == 1 ? 20 : 100;
         const bool hasDepth = round % 4 == 1, wantsGaps = round % 5 < 2;
         const double least = round % 7 == 0 ? 0.05 : 0;
@@ -199,7 +200,7 @@ enum class Flaw { None, Hole, HoleInOne, NotFinite, AlphaOutside, Crossing, NanD
 TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and sorted", "[compositing]")
 {
     std::mt19937 random(13);
-    for (int round = 0; round < 400; ++round) {
+    for (int round = 0; round < repeats(400); ++round) {
         const bool isSorted = round % 2 == 1;
         const auto flaw = static_cast<Flaw>(random() % 7);
         const double least = round % 7 == 0 && flaw != Flaw::NotFinite ? 0.05 : 0;
@@ -264,7 +265,7 @@ TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and so
 TEST_CASE("Rows in place with many gaps are folded pixel by pixel, in order and sorted", "[compositing]")
 {
     std::mt19937 random(17);
-    for (int round = 0; round < 200; ++round) {
+    for (int round = 0; round < repeats(200); ++round) {
         const bool isSorted = round % 2 == 1, hasDepth = isSorted && round % 10 != 9;
         const double least = round % 7 == 0 ? 0.05 : 0;
         const dfb::Region valid{round % 3 == 0 ? 0 : 5, 0, round % 3 == 1 ? width : width - round % 40, height};

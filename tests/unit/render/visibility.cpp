@@ -1,4 +1,5 @@
 // World, camera and visibility: the projection of a box covers all pixels whose rays can meet the box.
+#include "brief.hpp"
 #include "catch.hpp"
 
 #include <dfb/dfb.hpp>
@@ -55,10 +56,10 @@ bool meets(const dfb::Vec3& eye, const dfb::Vec3& direction, const dfb::Box3& bo
 TEST_CASE("The projection of a box covers every pixel whose rays meet it", "[visibility]")
 {
     Random random(21);
-    std::size_t missed = 0, hits = 0, behind = 0, around = 0;
+    int missed = 0, hits = 0, behind = 0, around = 0;
     std::string example;
     const std::vector<std::pair<int, int>> sizes{{40, 30}, {1, 1}, {64, 1}, {3, 57}};
-    for (int i = 0; i < 600; ++i) {
+    for (int i = 0; i < repeats(600); ++i) {
         const auto [width, height] = sizes[static_cast<std::size_t>(i) % sizes.size()];
         const dfb::Vec3 eye = point(random, 3), target = point(random, 1);
         const dfb::PerspectiveCamera camera(eye, target, {0.1f, 1.0f, -0.05f},
@@ -93,15 +94,15 @@ TEST_CASE("The projection of a box covers every pixel whose rays meet it", "[vis
     INFO(example);
     CHECK(missed == 0);
     // The scenes are not all of one kind.
-    CHECK(hits > 10000);
-    CHECK(behind > 50);
-    CHECK(around > 5);
+    CHECK(hits > repeats(10000));
+    CHECK(behind > repeats(50));
+    CHECK(around > repeats(5));
 }
 
 TEST_CASE("The projection covers the points of boxes in large images, and not much more", "[visibility]")
 {
     Random random(5);
-    std::size_t missed = 0, inside = 0;
+    int missed = 0, inside = 0;
     double largest = 0;
     for (int i = 0; i < 300; ++i) {
         const int width = 2000, height = 1500;
@@ -133,7 +134,7 @@ TEST_CASE("The projection covers the points of boxes in large images, and not mu
             largest = std::max({largest, region.width() - (x1 - x0), region.height() - (y1 - y0)});
     }
     CHECK(missed == 0);
-    CHECK(inside > 100000);
+    CHECK(inside > repeats(100000));
     // The margin on each side, and the pixels that the ends lie in: the corners of a box are its extremes.
     CHECK(largest <= 2.3);
 }
@@ -161,8 +162,8 @@ TEST_CASE("A footprint meets the tiles that the box projects to, and no others",
     const int width = 1500, height = 1100;
     const dfb::TileLayout layout(width, height, 64);
     const double scale = 0.5 * height / std::tan(20 * 3.14159265358979 / 180);
-    std::size_t missed = 0, superfluous = 0, saved = 0, pairs = 0;
-    for (int i = 0; i < 60; ++i) {
+    int missed = 0, superfluous = 0, saved = 0, pairs = 0;
+    for (int i = 0; i < repeats(60); ++i) {
         const dfb::PerspectiveCamera camera({0, 0, 10}, {0, 0, 0}, {0, 1, 0}, 40);
         const dfb::Vec3 center = point(random, 3);
         const auto extent = static_cast<float>(std::pow(10.0, uniform(random, -4, 0.3)));
@@ -194,7 +195,7 @@ TEST_CASE("A footprint meets the tiles that the box projects to, and no others",
         std::set<int> found;
         for (const auto& pair : dfb::visibleTiles(dfb::World({{1, box}}), camera, layout))
             found.insert(pair.tile);
-        pairs += found.size();
+        pairs += static_cast<int>(found.size());
         for (int tile = 0; tile < layout.tileCount(); ++tile) {
             const dfb::Region r = layout.region(tile);
             double nearest = 1e9;
@@ -209,8 +210,8 @@ TEST_CASE("A footprint meets the tiles that the box projects to, and no others",
     }
     CHECK(missed == 0);
     CHECK(superfluous == 0);
-    CHECK(pairs > 300);
-    CHECK(saved > 10); // within the rectangle around the projection
+    CHECK(pairs > repeats(300));
+    CHECK(saved > repeats(10)); // within the rectangle around the projection
 }
 
 TEST_CASE("Degenerate cameras and bricks that are none are refused", "[visibility]")
@@ -329,7 +330,7 @@ TEST_CASE("The bricks of a bisection have an order from anywhere", "[visibility_
 {
     std::mt19937 random(3);
     const auto uniform = [&](double a, double b) { return a + (b - a) * static_cast<double>(random() % 100000) / 1e5; };
-    for (int round = 0; round < 40; ++round) {
+    for (int round = 0; round < repeats(40); ++round) {
         std::vector<dfb::Brick> bricks;
         bisect(random, {{-1, -1, -1}, {1, 1, 1}}, 1 + static_cast<int>(random() % 40), bricks);
         const dfb::Vec3 eye{static_cast<float>(uniform(-2, 2)), static_cast<float>(uniform(-2, 2)),
@@ -360,7 +361,7 @@ TEST_CASE("The bricks of a bisection have an order along any direction", "[visib
 {
     std::mt19937 random(5);
     const auto uniform = [&](double a, double b) { return a + (b - a) * static_cast<double>(random() % 100000) / 1e5; };
-    for (int round = 0; round < 40; ++round) {
+    for (int round = 0; round < repeats(40); ++round) {
         std::vector<dfb::Brick> bricks;
         bisect(random, {{-1, -1, -1}, {1, 1, 1}}, 1 + static_cast<int>(random() % 40), bricks);
         // Looks along -z of its view, whose axes are two turns of those of the world; or along an axis.

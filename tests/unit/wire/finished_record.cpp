@@ -1,5 +1,6 @@
 // FinishedRecord: tiles come out as they went in, take little more than their pixels that are not background, and
 // malformed records are refused.
+#include "brief.hpp"
 #include "catch.hpp"
 
 #include <dfb/wire/finished_record.hpp>
@@ -132,7 +133,7 @@ TEST_CASE("Finished tiles that are malformed are refused or stay within their ti
             const Pixels pixels =
                 makeTile(record, layout.region(1), [](int x, int y) { return x < 9 || y % 5 == 2 || x % 7 == 3; });
             const auto right = recordOf(record, 1, pixels, splits);
-            for (int round = 0; round < 3000; ++round) {
+            for (int round = 0; round < repeats(3000); ++round) {
                 auto bytes = right;
                 if (round % 3 == 0)
                     bytes.resize(random() % bytes.size());
@@ -159,8 +160,8 @@ TEST_CASE("Finished tiles that are malformed are refused or stay within their ti
                 }
             }
         }
-    CHECK(refused > 9000); // those that were cut, at least, and most others
-    CHECK(taken > 100);    // a changed padding or pixel harms nobody
+    CHECK(refused > repeats(9000)); // those that were cut, at least, and most others
+    CHECK(taken > repeats(100));    // a changed padding or pixel harms nobody
 }
 
 } // namespace finished_record_cases

@@ -1,5 +1,6 @@
 // Sparse planes: spans and planes are unchanged after encoding and decoding, whatever the region, and invalid ones are
 // refused.
+#include "brief.hpp"
 #include "catch.hpp"
 
 #include <dfb/wire/sparse_planes.hpp>
@@ -93,7 +94,7 @@ TEST_CASE("Outside of a view's valid region nothing is read", "[wire]")
     std::mt19937 random(11);
     std::vector<float> image(4 * stride * size), colors(4 * size * size), expectedColors(colors);
     const dfb::Region places[] = {{100, 40, 100 + size, 40 + size}, {0, 0, 70, 33}};
-    for (int round = 0; round < 60; ++round) {
+    for (int round = 0; round < repeats(60); ++round) {
         View view;
         view.region = places[round % 2];
         view.stride = stride;
@@ -172,7 +173,7 @@ TEST_CASE("Active pixels come back at their places, in each format of planes, sp
     for (const dfb::Region region : {dfb::Region{0, 0, 1, 1}, dfb::Region{8, 16, 15, 19}, dfb::Region{0, 0, 130, 9}})
         for (const std::size_t colorWordBytes : {1u, 2u, 4u})
             for (const dfb::ChannelMask channels : {dfb::colorChannel, dfb::allChannels})
-                for (int round = 0; round < 12; ++round) {
+                for (int round = 0; round < repeats(12); ++round) {
                     const auto all = static_cast<std::size_t>(region.width() * region.height());
                     std::vector<bool> isActive(all);
                     for (std::size_t i = 0; i < all; ++i)
