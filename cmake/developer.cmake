@@ -19,6 +19,9 @@ if(NOT MSVC)
     $<$<BOOL:${DFB_WARNINGS_AS_ERRORS}>:-Werror>)
 endif()
 target_link_libraries(dfb_compiled PRIVATE dfb_developer_flags)
+if(CMAKE_CXX_FLAGS MATCHES "fsanitize") # tests that are not optimized then take much less time
+  target_compile_options(dfb_compiled PRIVATE -O1)
+endif()
 
 add_library(dfb_developer_headers INTERFACE)
 target_link_libraries(dfb_developer_headers INTERFACE dfb_developer_flags dfb::dfb dfb::testing)

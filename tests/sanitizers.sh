@@ -5,9 +5,9 @@
 #   "asan" leaves out tests with ranks as threads, which "tsan" runs; 2 and 7 ranks over MPI, as it runs 3; cameras,
 #     which "tsan" runs, too; and the check for uses of a function's variables after its end, which takes most of the
 #     time;
-#   "tsan" leaves out tests with a single thread, which "asan" runs: fuzz targets and the longer unit tests; and runs
-#     tests of whole frames on 1 and 4 ranks, not on 2, 3 and 7;
-#   both leave out instruction sets, numbers, counts of work and steps of credit, which take them minutes.
+#   "tsan" leaves out tests with a single thread, which "asan" runs: fuzz targets and the longer unit tests;
+#   both leave out instruction sets, numbers, counts of work and steps of credit, which take them minutes, and are brief
+#     in what they run: see tests/support/brief.hpp.
 set -u
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)

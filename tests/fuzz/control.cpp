@@ -353,7 +353,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     };
     d::Verdict good, bad;
     good.terms.passes = bad.terms.passes = 77;
-    good.sums = {1, 2, 3, 4, 5, 6, 7, 8};
+    good.sums = {{1, 2, 3, 4, 5, 6, 7, 8}};
     bad.error.emplace();
     bad.error->kind = dfb::ErrorKind::TimedOut;
     bad.error->tile = 4;
