@@ -291,7 +291,8 @@ public:
 
     // Makes a connection over the communicator and a framebuffer on it. Collective. Waits for all ranks. Throws
     // InvalidArgument on every rank if the configuration is wrong on any rank or differs between ranks, or if a rank
-    // lacks memory; TransportError if the transport cannot be used; std::system_error on a rank that gets no threads.
+    // lacks memory; TransportError if the transport cannot be used; std::system_error on a rank that gets no threads,
+    // and TransportError on the others.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
         : DistributedFrameBuffer(communicator, std::move(config), NetworkConfig(), std::move(pixelOp))
     {

@@ -777,9 +777,14 @@ private:
 };
 
 #if DFB_HAS_BODIES
-DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(const Connection& connection)
+DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(Connection& connection)
 {
-    return std::make_shared<ThreadExecutor>(connection.threadShare());
+    try {
+        return std::make_shared<ThreadExecutor>(connection.threadShare());
+    } catch (const std::exception& e) { // the other ranks would wait for this one
+        connection.giveUp(errorInfo(ErrorKind::Transport, e.what(), connection.rank()));
+        throw;
+    }
 }
 
 DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,

@@ -25,6 +25,10 @@
 #include <utility>
 #include <vector>
 
+#if defined(__GLIBC__)
+#include <pthread.h>
+#endif
+
 namespace errors_cases {
 
 namespace {
@@ -1466,6 +1470,45 @@ TEST_CASE("A rank that leaves before the framebuffer is made", "[errors]")
                 CHECK(has(texts[static_cast<std::size_t>(rank)], "TransportError"));
     }
 }
+
+#if defined(__GLIBC__)
+TEST_CASE("A rank that gets no threads: the others learn of it, even if it keeps its connection", "[errors]")
+{
+    std::vector<std::string> texts(3);
+    std::promise<void> told[3];
+    dfb::runRanks(3, [&](const dfb::InprocCommunicator& communicator) {
+        const int rank = communicator.rank();
+        const auto connection = dfb::connect<dfb::InprocTransport>(communicator);
+        dfb::FrameBufferConfig config = configOf(scene::makeScene(1));
+        config.executor = std::make_shared<dfb::CallerExecutor>();
+        FrameBuffer<Blend> first(connection, config);
+        first.allReduce({1}, dfb::Reduce::Sum); // all ranks are here: nobody else makes a thread from now on
+        const auto make = [&] { FrameBuffer<Blend> second(connection, config); };
+        const auto at = static_cast<std::size_t>(rank);
+        if (rank != 1) {
+            texts[at] = outcomeOf(make);
+            told[at].set_value();
+            return;
+        }
+        config.executor = nullptr; // makes threads, with a stack for which there is no room
+        pthread_attr_t usual, tooMuch;
+        pthread_getattr_default_np(&usual);
+        pthread_getattr_default_np(&tooMuch);
+        pthread_attr_setstacksize(&tooMuch, std::size_t{1} << 50);
+        pthread_setattr_default_np(&tooMuch);
+        texts[at] = outcomeOf(make);
+        pthread_setattr_default_np(&usual);
+        for (const std::size_t other : {0, 2})
+            if (told[other].get_future().wait_for(std::chrono::seconds(60)) != std::future_status::ready)
+                texts[at] += "; rank " + std::to_string(other) + " still waits";
+    });
+    INFO(joined(texts));
+    CHECK(has(texts[1], "exception: "));
+    CHECK(!has(texts[1], "still waits"));
+    for (const std::size_t other : {0, 2})
+        CHECK(has(texts[other], "TransportError: dfb: transport failure: rank 1"));
+}
+#endif
 
 TEST_CASE("runRanks refuses a number of ranks that is none", "[errors]")
 {
