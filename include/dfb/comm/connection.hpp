@@ -293,6 +293,8 @@ public:
     // moved.
     bool helpProgress() { return progress_.tryPoll(); }
     bool hasProgressThread() const noexcept { return progress_.running(); }
+    // Whether only threads that wait move messages: when none waits any more, nobody does.
+    bool hasOnlyCallers() const noexcept { return link_->needsPolling() && !progress_.running(); }
 
     // Whether a thread that waits must call poll() itself.
     bool needsCaller() const noexcept { return link_->needsPolling() && progress_.needsCaller(); }

@@ -317,8 +317,7 @@ public:
         report.compressed = compressed;
         report.threads = mailbox_->executor().concurrency();
         const Connection& connection = mailbox_->connection();
-        report.progress =
-            connection.needsCaller() && !connection.hasProgressThread() ? Progress::Caller : Progress::Thread;
+        report.progress = connection.hasOnlyCallers() ? Progress::Caller : Progress::Thread;
         verdict.addTo(report);
         // Like wireErrorBound, it also bounds what the image keeps from earlier frames.
         report.mergeErrorBound = mergeErrorBound_ = std::max(mergeErrorBound_, report.mergeErrorBound);

@@ -315,9 +315,9 @@ private:
     // lost must not hold up the vote: then finished tiles still have the time that waitForFinishedTiles() waits.
     bool mayVote() const
     {
-        const bool needsCaller = mailbox_.connection().needsCaller();
-        return ((!needsCaller && !terms_.allowPartial) || isCreditInDoubt_ || mailbox_.flow().allSent())
-               && (!needsCaller || mailbox_.connection().quiet());
+        const bool onlyCallers = mailbox_.connection().hasOnlyCallers();
+        return ((!onlyCallers && !terms_.allowPartial) || isCreditInDoubt_ || mailbox_.flow().allSent())
+               && (!onlyCallers || mailbox_.connection().quiet());
     }
 
     // ---- waiting
