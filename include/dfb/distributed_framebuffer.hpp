@@ -455,7 +455,8 @@ private:
     }
 
     std::shared_ptr<Connection> connection_;
-    // Each pair of one of these and one of engines_ has one frame at a time. The pairs take turns.
+    // Each pair of one of these and one of engines_ has one frame at a time. The pairs take turns. They are
+    // OperationsOf these types, but a vector of that would be compiled again for each operation.
     std::vector<std::unique_ptr<detail::Operations>> operations_;
     std::vector<std::unique_ptr<Engine>> engines_;
     std::size_t next_ = 0;

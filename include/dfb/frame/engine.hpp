@@ -73,7 +73,7 @@ public:
     virtual void leave() noexcept = 0; // in place of end(), when an exception passes
 };
 
-// Of a unique_ptr to an engine whose frame is open.
+// The deleter of a unique_ptr to an engine whose frame is open.
 struct LeaveFrame {
     void operator()(Engine* engine) const noexcept { engine->leave(); }
 };

@@ -96,7 +96,10 @@ public:
             pixelOp_.newFrame(pixelData);
     }
 
-    std::unique_ptr<TileStage> makeTile() const override { return std::unique_ptr<TileStage>(new Stage(tileData_)); }
+    std::unique_ptr<TileStage> makeTile() const override
+    {
+        return std::unique_ptr<TileStage>(new Stage(tileData_)); // make_unique() would be compiled for each operation
+    }
 
     bool opaqueHides([[maybe_unused]] const TileInfo& info) const override
     {
