@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cstdint>
 #include <functional>
+#include <limits>
 #include <memory>
 #include <numeric>
 #include <vector>
@@ -22,17 +23,20 @@ public:
     static constexpr int maxImageSize = 1 << 16; // pixels a side
 
     TileLayout() = default;
-    // Throws InvalidArgument for an image size outside [1, 65536], or a tile size below 1.
+    // Throws InvalidArgument for an image size or a tile size outside [1, 65536], or for more than 2^31 - 1 tiles.
     TileLayout(int width, int height, int tileSize) : TileLayout(width, height, tileSize, tileSize) {}
     TileLayout(int width, int height, int tileWidth, int tileHeight)
         : width_(width), height_(height), tileWidth_(tileWidth), tileHeight_(tileHeight)
     {
         if (width < 1 || height < 1 || width > maxImageSize || height > maxImageSize)
             detail::failArgument("the image size is %dx%d, it must be 1 to 65536 pixels a side", width, height);
-        if (tileWidth < 1 || tileHeight < 1)
-            detail::failArgument("the tile size is %dx%d, it must be 1 or more", tileWidth, tileHeight);
+        if (tileWidth < 1 || tileHeight < 1 || tileWidth > maxImageSize || tileHeight > maxImageSize)
+            detail::failArgument("the tile size is %dx%d, it must be 1 to 65536 pixels a side", tileWidth, tileHeight);
         tilesX_ = (width + tileWidth - 1) / tileWidth;
         tilesY_ = (height + tileHeight - 1) / tileHeight;
+        if (tilesX_ > std::numeric_limits<int>::max() / tilesY_)
+            detail::failArgument("%dx%d pixels have more than 2^31 - 1 tiles of %dx%d", width, height, tileWidth,
+                                 tileHeight);
     }
 
     int width() const noexcept { return width_; }

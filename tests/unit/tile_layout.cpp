@@ -42,14 +42,18 @@ TEST_CASE("The largest images", "[layout]")
     const dfb::TileLayout all(65536, 65536, 8);
     CHECK(all.tileCount() == 8192 * 8192);
     CHECK(all.region(all.tileCount() - 1) == dfb::Region{65528, 65528, 65536, 65536});
+    CHECK(dfb::TileLayout(65536, 65535, 2, 1).tileCount() == 32768 * 65535);
+    CHECK_THROWS_AS(dfb::TileLayout(65536, 65536, 2, 1), dfb::InvalidArgument); // 2^31 tiles
+    CHECK_THROWS_AS(dfb::TileLayout(65536, 65536, 1), dfb::InvalidArgument);
     for (const auto& [width, height] :
          std::vector<std::pair<int, int>>{{0, 5}, {5, 0}, {-1, 5}, {65537, 5}, {5, 65537}})
         CHECK_THROWS_AS(dfb::TileLayout(width, height, 64), dfb::InvalidArgument);
 }
 
-TEST_CASE("Tiles without pixels are refused", "[layout]")
+TEST_CASE("Tiles without pixels or larger than any image are refused", "[layout]")
 {
-    for (const auto& [width, height] : std::vector<std::pair<int, int>>{{0, 8}, {8, 0}, {-8, 8}})
+    for (const auto& [width, height] :
+         std::vector<std::pair<int, int>>{{0, 8}, {8, 0}, {-8, 8}, {65537, 8}, {8, 2147483647}})
         CHECK_THROWS_AS(dfb::TileLayout(5, 5, width, height), dfb::InvalidArgument);
 }
 
