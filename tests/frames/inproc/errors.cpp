@@ -1476,14 +1476,15 @@ TEST_CASE("A rank that gets no threads: the others learn of it, even if it keeps
 {
     std::vector<std::string> texts(3);
     std::promise<void> told[3];
+    std::atomic<int> here{0};
     dfb::runRanks(3, [&](const dfb::InprocCommunicator& communicator) {
         const int rank = communicator.rank();
         const auto connection = dfb::connect<dfb::InprocTransport>(communicator);
         dfb::FrameBufferConfig config = configOf(scene::makeScene(1));
         config.executor = std::make_shared<dfb::CallerExecutor>();
-        FrameBuffer<Blend> first(connection, config);
-        first.allReduce({1}, dfb::Reduce::Sum); // all ranks are here: nobody else makes a thread from now on
-        const auto make = [&] { FrameBuffer<Blend> second(connection, config); };
+        for (++here; here < 3;) // else another may still connect, or make a thread, when rank 1 has failed
+            std::this_thread::yield();
+        const auto make = [&] { FrameBuffer<Blend> fb(connection, config); };
         const auto at = static_cast<std::size_t>(rank);
         if (rank != 1) {
             texts[at] = outcomeOf(make);
@@ -1498,6 +1499,8 @@ TEST_CASE("A rank that gets no threads: the others learn of it, even if it keeps
         pthread_setattr_default_np(&tooMuch);
         texts[at] = outcomeOf(make);
         pthread_setattr_default_np(&usual);
+        pthread_attr_destroy(&usual);
+        pthread_attr_destroy(&tooMuch);
         for (const std::size_t other : {0, 2})
             if (told[other].get_future().wait_for(std::chrono::seconds(60)) != std::future_status::ready)
                 texts[at] += "; rank " + std::to_string(other) + " still waits";
