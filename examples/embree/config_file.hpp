@@ -1,13 +1,16 @@
 // Files of options, in JSON or TOML.
 #pragma once
 
+#include "options.hpp"
+
 #include <CLI/CLI.hpp>
-#include <nlohmann/json.hpp>
 
 #include <istream>
 #include <iterator>
 #include <sstream>
+#include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace example {
@@ -35,33 +38,21 @@ private:
             std::istringstream toml(text);
             return CLI::ConfigTOML::from_config(toml);
         }
-        const auto all = nlohmann::ordered_json::parse(text, nullptr, false);
-        if (all.is_discarded())
-            throw CLI::ConfigError("--config: the file is no JSON");
+        OptionsInFile all;
+        try {
+            all = parseJsonOptions(text);
+        } catch (const std::runtime_error& error) {
+            throw CLI::ConfigError(error.what());
+        }
         std::vector<CLI::ConfigItem> found;
-        for (const auto& [name, value] : all.items()) {
+        for (auto& [name, values] : all) {
             CLI::ConfigItem item;
             item.name = name;
-            for (const auto& word : value.is_array() ? value : nlohmann::ordered_json::array({value})) {
-                if (!word.is_string() && !word.is_number() && !word.is_boolean())
-                    throw CLI::ConfigError("--config: " + name + ": expected a text, a number, true or false");
-                item.inputs.push_back(word.is_string() ? word.get<std::string>() : word.dump());
-            }
+            item.inputs = std::move(values);
             found.push_back(std::move(item));
         }
         return found;
     }
 };
-
-namespace detail {
-
-// An option's value: a number, true or false if it is one, otherwise a text.
-inline nlohmann::ordered_json valueOf(const std::string& text)
-{
-    const nlohmann::ordered_json value = nlohmann::ordered_json::parse(text, nullptr, false);
-    return value.is_number() || value.is_boolean() ? value : nlohmann::ordered_json(text);
-}
-
-} // namespace detail
 
 } // namespace example

@@ -1,7 +1,7 @@
 // LiveRun: renders what the viewers of a live view want to see, until they end the job.
 #pragma once
 
-#include "frames_by.hpp"
+#include "camera.hpp"
 #include "on_all_ranks.hpp"
 #include "run_config.hpp"
 
@@ -26,8 +26,8 @@
 namespace example {
 
 // Frames accumulate while the camera rests.
-using LiveBlend = dfb::Progressive<Blend>;
-using LiveSingle = dfb::Progressive<Single>;
+using LiveBlend = dfb::Progressive<BlendOp>;
+using LiveSingle = dfb::Progressive<SingleOp>;
 
 template <class TileOp>
 class LiveRun {
@@ -35,8 +35,8 @@ class LiveRun {
     static constexpr bool isSingle = std::is_same_v<TileOp, LiveSingle>;
 
 public:
-    LiveRun(std::shared_ptr<dfb::Connection> connection, const Options& o, int threads)
-        : o_(o), fb_(connection, configOf(o, threads > 0 ? threads : connection->threadShare()))
+    LiveRun(std::shared_ptr<dfb::Connection> connection, const Options& o)
+        : o_(o), fb_(connection, configOf(o, o.threads > 0 ? o.threads : connection->threadShare()))
     {
     }
 

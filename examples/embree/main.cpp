@@ -1,6 +1,7 @@
 // dfb_render: renders volumes, meshes and spheres over several ranks; see --help.
+#include "live_run.hpp"
 #include "options.hpp"
-#include "run.hpp"
+#include "rank_run.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -12,11 +13,13 @@
 #include <cstdio>
 #include <cstdlib>
 #include <exception>
+#include <memory>
 #include <mutex>
 #include <optional>
 #include <sstream>
 #include <string>
 #include <thread>
+#include <utility>
 
 namespace example {
 namespace {
@@ -38,13 +41,23 @@ private:
 #endif
 };
 
+// One rank's whole run. Returns the exit code, the same on all ranks. Exceptions are not caught.
+int runRank(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o)
+{
+    if (!o.live)
+        return RankRun(std::move(connection), transport, o).run();
+    if (o.mode == Mode::Image)
+        return LiveRun<LiveSingle>(std::move(connection), o).run();
+    return LiveRun<LiveBlend>(std::move(connection), o).run();
+}
+
 int runInThreads(const Options& o, int ranks)
 {
     const WorkerLimit limit(std::max(1, o.threads) * ranks);
     std::mutex mutex;
     int code = 0;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
-        const int mine = runInproc(communicator, o, o.threads);
+        const int mine = runRank(dfb::connect<dfb::InprocTransport>(communicator, networkOf(o)), "inproc", o);
         const std::lock_guard<std::mutex> lock(mutex);
         code = std::max(code, mine);
     });
@@ -109,7 +122,8 @@ int runWithMpi(int argc, char** argv, const ParsedOptions& parsed)
     int code = exitFailed;
     try {
         const WorkerLimit limit(parsed.options->threads);
-        code = runMpi(MPI_COMM_WORLD, *parsed.options, parsed.options->threads);
+        code = runRank(dfb::connect<dfb::MpiTransport>(MPI_COMM_WORLD, networkOf(*parsed.options)), "mpi",
+                       *parsed.options);
     } catch (const dfb::InvalidArgument& e) { // this and the next are the same on all ranks
         if (rank == 0)
             std::fprintf(stderr, "dfb_render: %s\n", e.what());

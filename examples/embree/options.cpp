@@ -474,15 +474,4 @@ private:
 
 ParsedOptions parseOptions(int argc, const char* const* argv) { return CommandLine().parse(argc, argv); }
 
-std::string optionsText(const std::vector<std::string>& scene,
-                        const std::vector<std::pair<std::string, std::string>>& given)
-{
-    nlohmann::ordered_json json;
-    json["scene"] = scene;
-    for (const auto& [name, text] : given)
-        json[name] = detail::valueOf(text);
-    using Json = nlohmann::ordered_json; // file names may have any bytes
-    return json.dump(2, ' ', false, Json::error_handler_t::replace) + '\n';
-}
-
 } // namespace example

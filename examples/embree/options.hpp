@@ -103,7 +103,13 @@ struct ParsedOptions {
 // Prints nothing, so that one of many ranks can do it.
 ParsedOptions parseOptions(int argc, const char* const* argv);
 
-// Returns the text of a file with which --config repeats this run.
+// Each option in a file of options, and its values.
+using OptionsInFile = std::vector<std::pair<std::string, std::vector<std::string>>>;
+
+// The options in the text of a file that is a JSON object. Throws std::runtime_error.
+OptionsInFile parseJsonOptions(const std::string& text);
+
+// Returns the text of a JSON file with which --config repeats this run.
 std::string optionsText(const std::vector<std::string>& scene,
                         const std::vector<std::pair<std::string, std::string>>& given);
 

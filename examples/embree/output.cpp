@@ -1,9 +1,6 @@
 // Writing images and statistics.
 #include "output.hpp"
 
-#include "config_file.hpp"
-
-#include <nlohmann/json.hpp>
 #include <png.h>
 #define XXH_INLINE_ALL
 #include <xxhash.h>
@@ -86,75 +83,6 @@ void writePngFile(const std::string& path, int width, int height, int bits, bool
     const bool closed = std::fclose(file) == 0;
     if (!written || !closed)
         detail::failToWrite(path, errno != 0 ? std::strerror(errno) : "libpng cannot");
-}
-
-// The `value` of each rank.
-template <class Rank, class Value>
-nlohmann::ordered_json ofRanks(const std::vector<Rank>& ranks, const Value& value)
-{
-    nlohmann::ordered_json all = nlohmann::ordered_json::array();
-    for (const Rank& rank : ranks)
-        all.push_back(value(rank));
-    return all;
-}
-
-nlohmann::ordered_json toJson(const RunStats& run)
-{
-    nlohmann::ordered_json json;
-    json["version"] = run.version;
-    json["scene"] = run.scene;
-    json["options"] = nlohmann::ordered_json::object();
-    for (const auto& [name, text] : run.options)
-        json["options"][name] = detail::valueOf(text);
-    json["ranks"] = run.ranks.size();
-    json["threads_of_ranks"] = ofRanks(run.ranks, [](const RankStats& r) { return r.threads; });
-    json["transport"] = run.transport;
-    json["mode"] = run.mode;
-    json["width"] = run.width;
-    json["height"] = run.height;
-    json["image_hash"] = run.imageHash;
-    json["mean_alpha"] = run.meanAlpha;
-    const std::size_t slowest = slowestOf(run.ranks);
-    json["slowest_rank"] = slowest;
-    const auto add = [](auto& to, const auto& ranks, std::size_t which, const char* name, const auto& value) {
-        to[name] = value(ranks[which]);
-        to[std::string(name) + "_of_ranks"] = ofRanks(ranks, value);
-    };
-    add(json, run.ranks, slowest, "total_ms", [](const RankStats& r) { return r.totalMs; });
-    add(json, run.ranks, slowest, "load_ms", [](const RankStats& r) { return r.times.loadMs; });
-    add(json, run.ranks, slowest, "render_ms", [](const RankStats& r) { return r.times.renderMs; });
-    add(json, run.ranks, slowest, "compositing_ms", [](const RankStats& r) { return r.times.compositingMs; });
-    add(json, run.ranks, slowest, "write_ms", [](const RankStats& r) { return r.times.writeMs; });
-    json["bytes_read_of_ranks"] = ofRanks(run.ranks, [](const RankStats& r) { return r.bytesRead; });
-    json["run_ms"] = run.runMs;
-    json["samples_taken"] = run.samplesTaken;
-    json["samples_saved"] = run.samplesSaved;
-    json["frames"] = nlohmann::ordered_json::array();
-    for (const FrameStats& frame : run.frames) {
-        nlohmann::ordered_json entry;
-        using Rank = RankFrameStats;
-        const std::size_t last = slowestOf(frame.ranks);
-        entry["slowest_rank"] = last;
-        add(entry, frame.ranks, last, "total_ms", [](const Rank& r) { return r.times.totalMs(); });
-        add(entry, frame.ranks, last, "render_ms", [](const Rank& r) { return r.times.renderMs; });
-        add(entry, frame.ranks, last, "compositing_ms", [](const Rank& r) { return r.times.compositingMs; });
-        add(entry, frame.ranks, last, "write_ms", [](const Rank& r) { return r.times.writeMs; });
-        entry["bytes_sent"] = frame.report.bytesSent;
-        entry["messages_sent"] = frame.report.messagesSent;
-        entry["tiles_total"] = frame.report.tilesTotal;
-        entry["tiles_touched"] = frame.report.tilesTouched;
-        entry["peak_memory_bytes"] = frame.report.peakMemoryBytes;
-        entry["order_undefined_pixels"] = frame.report.orderUndefinedPixels;
-        entry["merge_error_bound"] = frame.report.mergeErrorBound;
-        entry["wire_color"] = dfb::nameOf(frame.report.wireColor);
-        entry["wire_error_bound"] = frame.report.wireErrorBound;
-        entry["compressed"] = frame.report.compressed;
-        entry["compressed_links"] = frame.report.compressedLinks;
-        entry["tiles_rendered"] = ofRanks(frame.ranks, [](const Rank& r) { return r.tilesRendered; });
-        entry["work_of_ranks"] = ofRanks(frame.ranks, [](const Rank& r) { return r.work; });
-        json["frames"].push_back(entry);
-    }
-    return json;
 }
 
 } // namespace
@@ -279,12 +207,6 @@ void writeText(const std::string& path, const std::string& text)
     stream.close();
     if (!stream)
         detail::failToWrite(path, std::strerror(errno));
-}
-
-void writeStats(const std::string& path, const RunStats& run)
-{
-    using Json = nlohmann::ordered_json; // file names may have any bytes
-    writeText(path, toJson(run).dump(2, ' ', false, Json::error_handler_t::replace) + '\n');
 }
 
 } // namespace example

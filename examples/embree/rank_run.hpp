@@ -34,8 +34,8 @@ namespace example {
 
 class RankRun {
 public:
-    RankRun(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o, int threads)
-        : o_(o), transport_(transport), threads_(threads > 0 ? threads : connection->threadShare())
+    RankRun(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o)
+        : o_(o), transport_(transport), threads_(o.threads > 0 ? o.threads : connection->threadShare())
     {
         dfb::FrameBufferConfig config = configOf(o, threads_);
         if (!o.trace.empty())

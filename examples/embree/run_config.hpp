@@ -14,6 +14,11 @@
 
 namespace example {
 
+// The tiles have all channels that the renderer can fill. Channels that no image has are not sent.
+inline constexpr dfb::ChannelMask tileChannels = dfb::allChannels & ~dfb::farChannel;
+using BlendOp = dfb::BasicAlphaBlend<64, tileChannels>;
+using SingleOp = dfb::BasicImageParallel<64, tileChannels>;
+
 // Which tile operation the options ask for.
 enum class Compositing {
     Single,         // every rank has the whole scene, so a tile has one input

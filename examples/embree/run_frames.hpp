@@ -59,9 +59,5 @@ public:
 // `verification`. Throws as the constructor of DistributedFrameBuffer does.
 std::unique_ptr<RunFrames> makeFrames(std::shared_ptr<dfb::Connection> connection, const Options& options,
                                       const dfb::FrameBufferConfig& config, dfb::testing::Verification& verification);
-// The same, for a compositing where each tile has one input.
-std::unique_ptr<RunFrames> makeSingleFrames(std::shared_ptr<dfb::Connection> connection, const Options& options,
-                                            const dfb::FrameBufferConfig& config,
-                                            dfb::testing::Verification& verification);
 
 } // namespace example

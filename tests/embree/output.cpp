@@ -3,6 +3,7 @@
 
 #include <output.hpp>
 
+#include <nlohmann/json.hpp>
 #include <png.h>
 
 #include <dfb/image.hpp>
