@@ -19,6 +19,9 @@ if(NOT MSVC)
     $<$<BOOL:${DFB_WARNINGS_AS_ERRORS}>:-Werror>)
 endif()
 target_link_libraries(dfb_compiled PRIVATE dfb_developer_flags)
+if(NOT MSVC) # -O3 takes a third longer to compile, and nothing that was measured is faster
+  target_compile_options(dfb_compiled PRIVATE $<$<CONFIG:Release>:-O2>)
+endif()
 if(CMAKE_CXX_FLAGS MATCHES "fsanitize") # tests that are not optimized then take much less time
   target_compile_options(dfb_compiled PRIVATE -O1)
 endif()
