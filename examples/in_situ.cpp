@@ -391,7 +391,7 @@ public:
         scene.fieldOfView = double(fieldOfView);
         scene.ranks = fb_.size();
         view_->open(scene, wishes_);
-        std::printf("look at it in a browser on this machine: %s\n", view_->url().c_str());
+        std::fputs(view_->invitation().c_str(), stdout);
         std::fflush(stdout);
         return {};
     }

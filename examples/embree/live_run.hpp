@@ -122,7 +122,7 @@ private:
         home.height = o_.height;
         home.samples = o_.passes;
         view_->open(scene, home);
-        std::printf("look at it in a browser on this machine: %s\n", view_->url().c_str());
+        std::fputs(view_->invitation().c_str(), stdout);
         std::fflush(stdout);
     }
 

@@ -6,10 +6,12 @@
 #include <nlohmann/json.hpp>
 #include <png.h>
 #include <turbojpeg.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <atomic>
 #include <condition_variable>
+#include <cstdio>
 #include <cstring>
 #include <deque>
 #include <map>
@@ -557,6 +559,17 @@ private:
 };
 
 } // namespace
+
+std::string LiveView::invitation() const
+{
+    char host[256] = "";
+    if (gethostname(host, sizeof host - 1) != 0)
+        std::snprintf(host, sizeof host, "HOST");
+    const std::size_t begin = url().rfind(':') + 1;
+    const std::string port = url().substr(begin, url().find('/', begin) - begin);
+    return "look at it in a browser on this machine: " + url() + "\nfrom another machine, first run there: ssh -L "
+           + port + ":127.0.0.1:" + port + ' ' + host + '\n';
+}
 
 std::unique_ptr<LiveView> LiveView::listen(const std::string& title, int port, bool hasSteps)
 {

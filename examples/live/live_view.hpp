@@ -80,6 +80,8 @@ public:
 
     // The address to open in a browser on this machine.
     virtual const std::string& url() const = 0;
+    // Two lines to print: the address, and the command that makes it reachable from another machine.
+    std::string invitation() const;
 
     // Viewers may have wishes from now on; `home` is what is shown until they have.
     virtual void open(const LiveScene& scene, const LiveWishes& home) = 0;

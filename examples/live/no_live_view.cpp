@@ -11,4 +11,6 @@ std::unique_ptr<LiveView> LiveView::listen(const std::string&, int, bool)
                              "missing: " DFB_LIVE_MISSING);
 }
 
+std::string LiveView::invitation() const { return {}; } // there is no view
+
 } // namespace example

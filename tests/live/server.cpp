@@ -167,6 +167,9 @@ TEST_CASE("a live view listens on the loopback address alone, with a new token e
     CHECK(one.token.size() == 32);
     CHECK(one.token != other.token);
     CHECK(one.port != other.port);
+    const std::string port = std::to_string(one.port);
+    CHECK(one.view.invitation().find(": " + one.view.url() + '\n') != std::string::npos);
+    CHECK(one.view.invitation().find("ssh -L " + port + ":127.0.0.1:" + port + ' ') != std::string::npos);
     std::string why;
     try {
         example::LiveView::listen("second", one.port, false);
