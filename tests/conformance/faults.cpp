@@ -225,6 +225,16 @@ TEST_CASE("Late and out of order, all messages come")
     CHECK(sorted(late.received) == sorted(allOf(2000)));
 }
 
+TEST_CASE("A message that would be delayed and reordered counts as delayed")
+{
+    FaultOptions faults;
+    faults.reorder = 1;
+    faults.delay = 1;
+    const Run late = run(faults, 100);
+    CHECK(late.counts->delayed == 100);
+    CHECK(late.counts->reordered == 0);
+}
+
 TEST_CASE("What is held is let go by an orderly stop, and dropped by another")
 {
     FaultOptions faults;

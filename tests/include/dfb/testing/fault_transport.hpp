@@ -29,7 +29,8 @@ struct FaultCounts {
     std::atomic<std::int64_t> reordered{0}, delayed{0}, duplicated{0}, dropped{0}, corrupted{0};
 };
 
-// The probabilities are per message and independent of each other; a message that is dropped counts as nothing else.
+// The probabilities are per message and independent of each other. A message that is dropped counts as nothing else;
+// one that would be delayed and reordered is only delayed.
 struct FaultOptions {
     std::uint64_t seed = 0;
     double reorder = 0;   // 1 to 4 later messages to that rank overtake it, if they come within maxDelay
@@ -145,15 +146,16 @@ public:
             hold({destination, std::move(copy), Clock::now() + decision.copyDelayBy, never});
             ++counts_->duplicated;
         }
-        counts_->reordered += decision.reorder;
-        counts_->delayed += decision.delay;
-        if (decision.delay)
+        if (decision.delay) {
+            ++counts_->delayed;
             hold({destination, std::move(message), Clock::now() + decision.delayBy, never});
-        else if (decision.reorder)
+        } else if (decision.reorder) {
+            ++counts_->reordered;
             hold({destination, std::move(message), Clock::now() + options_.maxDelay,
                   number + 1 + static_cast<std::uint64_t>(decision.overtakenBy)});
-        else
+        } else {
             base_.send(destination, std::move(message));
+        }
         if (heldCount_ > 0)
             base_.interrupt(); // poll() releases what this message has overtaken; nap() learns when to wake
     }
