@@ -132,9 +132,8 @@ inline const std::vector<dfb::testing::Pixel>& referenceOf(scene::Scene s, int s
 struct NextSamples {
     using Loop = accumulation::Loop;
 
-    template <class Op, class Transport>
-    static void accumulate(const typename Transport::Communicator& communicator, const std::vector<Loop>& loops,
-                           Result& result)
+    template <class Op>
+    static void accumulate(const Transport::Communicator& communicator, const std::vector<Loop>& loops, Result& result)
     {
         for (const Loop loop : loops) {
             scene::Scene s = scene::makeScene(accumulation::isImageParallel(loop) ? 1 : 6, 4, 45, 37);
@@ -195,16 +194,15 @@ struct NextSamples {
         }
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
-        accumulate<dfb::Progressive<dfb::BasicImageParallel<16>>, Transport>(
+        accumulate<dfb::Progressive<dfb::BasicImageParallel<16>>>(
             communicator, {Loop::ImageOwned, Loop::ImageRoundRobin, Loop::ImageDynamic}, result);
-        accumulate<dfb::Progressive<dfb::BasicAlphaBlend<16>>, Transport>(
+        accumulate<dfb::Progressive<dfb::BasicAlphaBlend<16>>>(
             communicator, {Loop::Data, Loop::Mixed, Loop::Declared, Loop::ByHand}, result);
-        accumulate<dfb::Progressive<dfb::BasicDeepBlend<16>>, Transport>(communicator, {Loop::Deep}, result);
-        accumulate<dfb::Progressive<dfb::BasicOrderedBlend<16>>, Transport>(communicator, {Loop::Ordered}, result);
+        accumulate<dfb::Progressive<dfb::BasicDeepBlend<16>>>(communicator, {Loop::Deep}, result);
+        accumulate<dfb::Progressive<dfb::BasicOrderedBlend<16>>>(communicator, {Loop::Ordered}, result);
         return result;
     }
 };
@@ -212,9 +210,9 @@ struct NextSamples {
 // Bricks move, come and go, and the id stays. The image is the mean of the samples of all frames, each with the bricks
 // of its frame, also in tiles that were empty at first or are empty now.
 struct MovingSamples {
-    template <class Op, class Transport>
-    static void accumulate(const typename Transport::Communicator& communicator,
-                           const std::vector<accumulation::Loop>& loops, Result& result)
+    template <class Op>
+    static void accumulate(const Transport::Communicator& communicator, const std::vector<accumulation::Loop>& loops,
+                           Result& result)
     {
         for (const auto loop : loops) {
             scene::Scene s = scene::makeScene(0, 4, 93, 45);
@@ -267,12 +265,11 @@ struct MovingSamples {
         }
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         using accumulation::Loop;
         Result result;
-        accumulate<dfb::Progressive<dfb::BasicAlphaBlend<16>>, Transport>(
+        accumulate<dfb::Progressive<dfb::BasicAlphaBlend<16>>>(
             communicator, {Loop::Data, Loop::Mixed, Loop::Declared, Loop::ByHand}, result);
         return result;
     }
@@ -298,8 +295,7 @@ double boundOfGrey(FrameBuffer& fb, const scene::Scene& s, std::uint64_t id, std
 
 // Pixels that stay in the image are as far off as in the frame that rendered them.
 struct KeptPixels {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5, 11);
@@ -319,8 +315,7 @@ struct KeptPixels {
 
 // The mean is off by no more than its worst sample, however many frames ago that was.
 struct RoundedSamples {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5, 11);

@@ -14,7 +14,6 @@
 
 namespace frame_cases {
 
-template <class Transport>
 using BlameFrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport>;
 
 // "rank 2"
@@ -58,8 +57,7 @@ struct BlamedParams {
         const char *usual, *its;
     };
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         using Params = dfb::FrameConfig;
         const std::vector<Case> cases{
@@ -77,7 +75,7 @@ struct BlamedParams {
             {"allowPartial", [](Params& p) { p.allowPartial = true; }, "false", "true"}};
         const scene::Scene s = scene::makeScene(3);
         Result result;
-        BlameFrameBuffer<Transport> fb(communicator, configOf(s));
+        BlameFrameBuffer fb(communicator, configOf(s));
         for (const int odd : oddRanks(fb.size()))
             for (const Case& c : cases) {
                 std::int64_t number = 0;
@@ -109,8 +107,7 @@ struct BlamedParams {
 
 // Framebuffers that are configured differently, or wrongly on one rank.
 struct BlamedConfig {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         using Config = dfb::FrameBufferConfig;
         struct Different {
@@ -155,10 +152,10 @@ struct BlamedConfig {
             Config config = configOf(s);
             if (rank == odd)
                 change(config);
-            return scene::outcomeOf([&] { BlameFrameBuffer<Transport> fb(communicator, config); });
+            return scene::outcomeOf([&] { BlameFrameBuffer fb(communicator, config); });
         };
         {
-            BlameFrameBuffer<Transport> fb(communicator, configOf(s));
+            BlameFrameBuffer fb(communicator, configOf(s));
             size = fb.size(), rank = fb.rank();
         }
         for (const int odd : oddRanks(size)) {
@@ -192,13 +189,13 @@ struct BlamedConfig {
                     const auto connection = dfb::connect<Transport>(communicator);
                     Config config = configOf(s);
                     config.image.width = width;
-                    BlameFrameBuffer<Transport> fb(connection, config);
+                    BlameFrameBuffer fb(connection, config);
                 });
             };
             const std::string sums = scene::outcomeOf([&] {
                 dfb::NetworkConfig options;
                 options.checksums = rank == odd;
-                BlameFrameBuffer<Transport> fb(communicator, configOf(s), options);
+                BlameFrameBuffer fb(communicator, configOf(s), options);
             });
             expectText(result, "checksums of rank " + std::to_string(odd), sums,
                        {"InvalidArgument: dfb: invalid argument: checksums is ", valuesText(odd, "false", "true")});
@@ -213,11 +210,11 @@ struct BlamedConfig {
             expectText(result, "width of rank " + std::to_string(odd), makeWide(rank == odd ? 98 : 97),
                        {refused + "width is ", valuesText(odd, "97", "98")});
         }
-        BlameFrameBuffer<Transport> fb(communicator, configOf(s));
+        BlameFrameBuffer fb(communicator, configOf(s));
         for (const int odd : oddRanks(size)) {
             std::vector<std::int64_t> values(rank == odd ? 3 : 2);
             expectText(result, "allReduce() of rank " + std::to_string(odd),
-                       scene::outcomeOf([&] { fb.allReduce(values, BlameFrameBuffer<Transport>::Reduce::Sum); }),
+                       scene::outcomeOf([&] { fb.allReduce(values, BlameFrameBuffer::Reduce::Sum); }),
                        {"InvalidArgument: dfb: invalid argument: rank ", " calls allReduce() of ",
                         "rank " + std::to_string(odd), "allReduce() of 3 values to their sum",
                         ": all ranks must make the same calls"});
@@ -229,10 +226,9 @@ struct BlamedConfig {
 
 // Ranks that make different collective calls.
 struct BlamedCalls {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
-        using Fb = BlameFrameBuffer<Transport>;
+        using Fb = BlameFrameBuffer;
         using Call = std::pair<std::string, std::function<void(Fb&)>>; // and its name in errors
         const auto reduce = [](typename Fb::Reduce how) { return [how](Fb& fb) { fb.allReduce({1}, how); }; };
         const Call sum{"allReduce() of 1 values to their sum", reduce(Fb::Reduce::Sum)},
@@ -267,10 +263,9 @@ struct BlamedCalls {
 
 // Errors in trees that a program builds itself, and in the ids of bricks.
 struct BlamedTree {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
-        using Fb = BlameFrameBuffer<Transport>;
+        using Fb = BlameFrameBuffer;
         Result result;
         const scene::Scene s = scene::makeScene(3);
         Fb fb(communicator, configOf(s));
@@ -363,10 +358,9 @@ struct BrokenCamera : scene::FlatCamera {
 
 // Exceptions between begin() and end().
 struct BlamedLoop {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
-        using Fb = BlameFrameBuffer<Transport>;
+        using Fb = BlameFrameBuffer;
         Result result;
         const scene::Scene s = scene::makeScene(3);
         Fb fb(communicator, configOf(s));
@@ -414,10 +408,9 @@ struct BlamedLoop {
 // An error of all ranks that also destroys their framebuffers. One rank gets it first; that this rank then leaves must
 // not hide the error from the others.
 struct BlamedOutside {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
-        using Fb = BlameFrameBuffer<Transport>;
+        using Fb = BlameFrameBuffer;
         Result result;
         dfb::FrameBufferConfig config(64, 48);
         config.quiet = std::chrono::milliseconds(1);
@@ -468,10 +461,9 @@ struct BlamedOutside {
 
 // A rank that destroys its framebuffer while the others go on.
 struct BlamedLeaving {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
-        using Fb = BlameFrameBuffer<Transport>;
+        using Fb = BlameFrameBuffer;
         Result result;
         const scene::Scene s = scene::makeScene(3);
         const int size = Fb(communicator, configOf(s)).size();

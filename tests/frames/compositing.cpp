@@ -17,8 +17,7 @@ namespace frame_cases {
 using dfb::testing::Exact;
 
 struct AuxChannels {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         using Op = dfb::BasicAlphaBlend<16, dfb::allChannels & ~dfb::farChannel>;
         Result result;
@@ -57,8 +56,7 @@ struct AuxImageParallel {
         }
     };
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         using Op = dfb::BasicImageParallel<16, dfb::allChannels & ~dfb::farChannel>;
         Result result;
@@ -86,8 +84,7 @@ struct AuxImageParallel {
 // ---- the nearest -----------------------------------------------------------------------------------------------
 
 struct Nearest {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(8, 9, 97, 61, 2);
@@ -202,7 +199,7 @@ struct BlackInFront {
         return wrong;
     }
 
-    template <class TileOp, class Transport, class RenderBrick>
+    template <class TileOp, class RenderBrick>
     static void frame(const std::shared_ptr<dfb::Connection>& connection, dfb::WireFormat format,
                       const RenderBrick& renderBrick, Result& result)
     {
@@ -223,8 +220,7 @@ struct BlackInFront {
         result.hash = result.hash * 31 + hashAux(fb.image());
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
@@ -252,9 +248,9 @@ struct BlackInFront {
         });
         for (const auto format :
              {dfb::WireFormat::Float32, dfb::WireFormat::Float16, dfb::WireFormat::Unorm16, dfb::WireFormat::Unorm8}) {
-            frame<Op, Transport>(connection, format, render, result);
-            frame<Op, Transport>(connection, format, find, result);
-            frame<dfb::Progressive<Op>, Transport>(connection, format, render, result);
+            frame<Op>(connection, format, render, result);
+            frame<Op>(connection, format, find, result);
+            frame<dfb::Progressive<Op>>(connection, format, render, result);
         }
         return result;
     }

@@ -236,7 +236,7 @@ struct Ending {
 };
 
 // Tests all faults that are possible with one loop and operation, on one framebuffer.
-template <class TileOp, class PixelOp, class Transport>
+template <class TileOp, class PixelOp>
 class Corner {
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, Transport>;
     using Frame = typename FrameBuffer::Frame;
@@ -718,8 +718,7 @@ private:
 } // namespace corners
 
 struct Corners {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         using namespace corners;
         using Blend = Trapped<dfb::BasicAlphaBlend<32>>;
@@ -732,16 +731,14 @@ struct Corners {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
         Count count{connection->size()};
-        faults<Blend, dfb::NoPixelOp, Transport>(connection, {Loop::Data, Loop::ByHand, Loop::Mixed},
-                                                 BlendRule::SortByDepth, result, count);
-        faults<Ordered, dfb::NoPixelOp, Transport>(connection, {Loop::Ordered}, BlendRule::InOrder, result, count);
-        faults<Depth, TrappedPixels<true>, Transport>(connection, {Loop::Data, Loop::ByHand}, BlendRule::Nearest,
-                                                      result, count);
-        faults<Whole, TrappedPixels<false>, Transport>(connection,
-                                                       {Loop::ImageOwned, Loop::ImageRoundRobin, Loop::ImageDynamic},
-                                                       BlendRule::SortByDepth, result, count);
-        faults<Accumulated, dfb::NoPixelOp, Transport>(connection, {Loop::Data}, BlendRule::SortByDepth, result, count);
-        faults<Deep, TrappedPixels<false>, Transport>(connection, {Loop::Deep}, BlendRule::SortByDepth, result, count);
+        faults<Blend, dfb::NoPixelOp>(connection, {Loop::Data, Loop::ByHand, Loop::Mixed}, BlendRule::SortByDepth,
+                                      result, count);
+        faults<Ordered, dfb::NoPixelOp>(connection, {Loop::Ordered}, BlendRule::InOrder, result, count);
+        faults<Depth, TrappedPixels<true>>(connection, {Loop::Data, Loop::ByHand}, BlendRule::Nearest, result, count);
+        faults<Whole, TrappedPixels<false>>(connection, {Loop::ImageOwned, Loop::ImageRoundRobin, Loop::ImageDynamic},
+                                            BlendRule::SortByDepth, result, count);
+        faults<Accumulated, dfb::NoPixelOp>(connection, {Loop::Data}, BlendRule::SortByDepth, result, count);
+        faults<Deep, TrappedPixels<false>>(connection, {Loop::Deep}, BlendRule::SortByDepth, result, count);
         static const std::map<int, int> expected{{1, 501}, {2, 1046}, {3, 1489}, {4, 1757}, {7, 670}};
         const auto found = expected.find(count.ranks);
         result.expect(found != expected.end() && found->second == count.faults,
@@ -754,7 +751,7 @@ private:
         int ranks, loops = 0, faults = 0;
     };
 
-    template <class TileOp, class PixelOp, class Transport>
+    template <class TileOp, class PixelOp>
     static void faults(const std::shared_ptr<dfb::Connection>& connection, const std::vector<corners::Loop>& loops,
                        dfb::BlendRule rule, Result& result, Count& count)
     {
@@ -762,7 +759,7 @@ private:
             dfb::FrameBufferConfig config = configOf(corners::sceneFor(loop, rule, 0), count.loops % 3);
             config.image.displayRank = (count.loops + count.ranks) % 2 == 0 ? 0 : count.ranks - 1;
             config.image.ownerMap = dfb::latticeOwner; // some ranks begin frames without a loop
-            corners::Corner<TileOp, PixelOp, Transport> corner(connection, config, loop, rule, result);
+            corners::Corner<TileOp, PixelOp> corner(connection, config, loop, rule, result);
             count.faults += corner.run();
             ++count.loops;
         }

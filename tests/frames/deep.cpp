@@ -101,18 +101,16 @@ struct Interleaved {
     }
 };
 
-template <class Transport>
 using DeepFrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicDeepBlend<16>, dfb::NoPixelOp, Transport>;
 
 struct Deep {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const Interleaved scene;
         scene::Scene size;
         size.width = scene.width, size.height = scene.height;
-        DeepFrameBuffer<Transport> fb(communicator, configOf(size, 2));
+        DeepFrameBuffer fb(communicator, configOf(size, 2));
         const dfb::World world = scene.world(fb.rank(), fb.size());
         dfb::FrameConfig params;
         params.background = scene.background;

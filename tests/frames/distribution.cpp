@@ -16,7 +16,6 @@
 namespace frame_cases {
 
 using Blend = dfb::BasicAlphaBlend<16>;
-template <class Transport>
 using BlendFrameBuffer = dfb::DistributedFrameBuffer<Blend, dfb::NoPixelOp, Transport>;
 
 // Brick i is held by `copies` ranks: i, i + 1, ..., modulo the number of ranks.
@@ -33,12 +32,11 @@ inline dfb::World replicated(const std::vector<dfb::Brick>& bricks, int rank, in
 // ---- the image does not show who rendered what ------------------------------------------------------------------
 
 struct Mixed {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(7, 3, 97, 61, 3);
-        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 2));
+        BlendFrameBuffer fb(communicator, configOf(s, 2));
         const auto check = [&](const dfb::FrameReport& report, const std::string& name) {
             if (!fb.isDisplayRank())
                 return;
@@ -97,12 +95,11 @@ struct Mixed {
 
 // If two ranks have a brick with the same id and different bounds, all ranks get an error that says so.
 struct OtherBounds {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(2);
-        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
+        BlendFrameBuffer fb(communicator, configOf(s, 1));
         const auto wide = static_cast<float>(1 + (fb.rank() == fb.size() - 1 ? 1 : 0));
         const std::string outcome = scene::outcomeOf([&] {
             const dfb::SharedWorld world(fb, dfb::World({{7, {{0, 0, 0}, {wide, 1, 1}}}}));
@@ -122,18 +119,17 @@ struct OtherBounds {
 // All data are in one corner of the view, most of them in one brick. If two ranks hold each brick, the slowest rank has
 // much less work, and less still if measured costs decide who renders.
 struct Unbalanced {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         scene::Scene s = scene::makeScene(0, 1, 256, 256, 1);
-        const int size = std::max(2, communicatorSize<Transport>(communicator));
+        const int size = std::max(2, communicatorSize(communicator));
         for (int i = 0; i < size; ++i) { // side by side, the first one is the largest
             const float x0 = i == 0 ? 0 : 64.0f + 8.0f * static_cast<float>(i - 1),
                         x1 = 64.0f + 8.0f * static_cast<float>(i);
             s.bricks.push_back({static_cast<std::uint32_t>(i), {{x0, 0, 0}, {x1, 96, 1}}});
         }
-        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
+        BlendFrameBuffer fb(communicator, configOf(s, 1));
         std::atomic<std::int64_t> samples{0};
         const auto render = [&](const dfb::Brick& b, auto& tile) {
             renderBrick(s, b, tile);
@@ -172,13 +168,12 @@ struct Unbalanced {
 
     // The scene has a brick per rank, so the image depends on the number of ranks. Hence run() returns no hash to
     // compare.
-    template <class Transport>
-    static int communicatorSize(const typename Transport::Communicator& communicator)
+    static int communicatorSize(const Transport::Communicator& communicator)
     {
         dfb::FrameBufferConfig config;
         config.image.width = config.image.height = 1;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-        return BlendFrameBuffer<Transport>(communicator, config).size();
+        return BlendFrameBuffer(communicator, config).size();
     }
 };
 
@@ -223,8 +218,8 @@ struct Ordered {
 
     enum class Way { Sorted, Told, ToldByData, InOrder };
 
-    template <Way way, class Transport>
-    static void render(const typename Transport::Communicator& communicator, Result& result, int copies, bool inPlace,
+    template <Way way>
+    static void render(const Transport::Communicator& communicator, Result& result, int copies, bool inPlace,
                        std::int64_t& bytes, std::uint64_t* depthHash = nullptr)
     {
         using Op = std::conditional_t<way == Way::InOrder, dfb::BasicOrderedBlend<16>, Blend>;
@@ -299,22 +294,21 @@ struct Ordered {
         *depthHash = depths;
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         std::int64_t bytes = 0;
         std::uint64_t depthHash = 0;
-        render<Way::Sorted, Transport>(communicator, result, 1, true, bytes, &depthHash);
-        render<Way::Told, Transport>(communicator, result, 1, true, bytes, &depthHash);
+        render<Way::Sorted>(communicator, result, 1, true, bytes, &depthHash);
+        render<Way::Told>(communicator, result, 1, true, bytes, &depthHash);
         for (const int copies : {1, 2}) {
             std::int64_t sorted = 0, told = 0, toldByData = 0, ordered = 0;
             for (const bool inPlace : {true, false}) {
-                render<Way::Sorted, Transport>(communicator, result, copies, inPlace, sorted);
-                render<Way::Told, Transport>(communicator, result, copies, inPlace, told);
+                render<Way::Sorted>(communicator, result, copies, inPlace, sorted);
+                render<Way::Told>(communicator, result, copies, inPlace, told);
                 if (copies == 1)
-                    render<Way::ToldByData, Transport>(communicator, result, copies, inPlace, toldByData);
-                render<Way::InOrder, Transport>(communicator, result, copies, inPlace, ordered);
+                    render<Way::ToldByData>(communicator, result, copies, inPlace, toldByData);
+                render<Way::InOrder>(communicator, result, copies, inPlace, ordered);
             }
             for (const std::int64_t without : {told, toldByData, ordered})
                 result.expect(sorted == 0 || without < sorted, "no depth to send, and yet " + std::to_string(without)
@@ -334,12 +328,11 @@ scene::Scene threeBricks()
 
 // An order that lacks a source, or that differs between ranks, fails the frame on all ranks; the next frame is right.
 struct WrongOrder {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = threeBricks();
-        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
+        BlendFrameBuffer fb(communicator, configOf(s, 1));
         const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
         dfb::DataParallelLoop loop(fb, world);
         const auto frame = [&](const std::vector<std::uint32_t>& sources) {
@@ -378,12 +371,11 @@ struct WrongOwner {
         }
     };
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = threeBricks();
-        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
+        BlendFrameBuffer fb(communicator, configOf(s, 1));
         dfb::DistributedFrameBuffer<dfb::BasicOrderedBlend<16>, dfb::NoPixelOp, Transport> inOrder(communicator,
                                                                                                    configOf(s, 1));
         const dfb::World mine(bricksOf(s, fb.rank(), fb.size()));

@@ -15,7 +15,6 @@
 namespace frame_cases {
 
 struct Hidden {
-    template <class Transport>
     using Fb = dfb::DistributedFrameBuffer<dfb::BasicOrderedBlend<16>, dfb::NoPixelOp, Transport>;
 
     static dfb::FrameBufferConfig config(bool depth)
@@ -37,12 +36,11 @@ struct Hidden {
     }
 
     // 6 bricks, each over the whole image, rendered by OrderedLoop.
-    template <class Transport>
-    static void renderAll(const typename Transport::Communicator& communicator, Result& result)
+    static void renderAll(const Transport::Communicator& communicator, Result& result)
     {
         auto patient = config(false);
         patient.quiet = std::chrono::seconds(60); // who waits for a word that is not given waits so long
-        Fb<Transport> fb(communicator, patient);
+        Fb fb(communicator, patient);
         dfb::World mine;
         for (std::uint32_t i = 0; i < 6; ++i)
             if (static_cast<int>(i) % fb.size() == fb.rank())
@@ -69,7 +67,7 @@ struct Hidden {
             const auto start = std::chrono::steady_clock::now();
             loop.render(scene::FlatCamera(), order, render);
             result.expect(std::chrono::steady_clock::now() - start < std::chrono::seconds(30), "no word");
-            const std::int64_t all = fb.allReduce({rendered}, Fb<Transport>::Reduce::Sum)[0];
+            const std::int64_t all = fb.allReduce({rendered}, Fb::Reduce::Sum)[0];
             // On a single rank, one worker at most renders a tile's brick while the other worker renders what hides it.
             const int tiles = fb.layout().tileCount();
             result.expect(all >= 3 * tiles && all <= 6 * tiles, std::to_string(all) + " tiles rendered");
@@ -101,14 +99,13 @@ struct Hidden {
 
     // By hand: rank 0 hides the input of the next rank, which waits until it is told and then sends nothing that
     // counts.
-    template <class Transport>
-    static void byHand(const typename Transport::Communicator& communicator, Result& result)
+    static void byHand(const Transport::Communicator& communicator, Result& result)
     {
-        Fb<Transport> fb(communicator, config(false));
+        Fb fb(communicator, config(false));
         const int other = 1 % fb.size();
         for (int round = 0; round < 3; ++round) {
             auto frame = fb.begin();
-            const auto tile = std::make_unique<typename Fb<Transport>::Tile>();
+            const auto tile = std::make_unique<typename Fb::Tile>();
             for (const auto& [t, generation] : {std::pair{0, 0}, {-1, 1}, {fb.layout().tileCount(), 1}}) {
                 const std::string text = scene::outcomeOf([&, t = t, g = generation] { frame.hide(t, g, fb.rank()); });
                 result.expect(scene::has(text, "InvalidArgument"), "what is no input is hidden: " + text);
@@ -145,16 +142,15 @@ struct Hidden {
 
     // Rank 0 says that it may hide the inputs of the next rank. Then it hides them in some tiles and shows them in
     // others, or says nothing more; in that case the next rank waits no longer than config.quiet.
-    template <class Transport>
-    static void waiting(const typename Transport::Communicator& communicator, Result& result)
+    static void waiting(const Transport::Communicator& communicator, Result& result)
     {
         auto c = config(false);
         c.quiet = std::chrono::milliseconds(20);
-        Fb<Transport> fb(communicator, c);
+        Fb fb(communicator, c);
         const int other = 1 % fb.size(), tiles = fb.layout().tileCount();
         for (const bool isSilent : {false, true}) {
             auto frame = fb.begin();
-            const auto tile = std::make_unique<typename Fb<Transport>::Tile>();
+            const auto tile = std::make_unique<typename Fb::Tile>();
             const auto set = [&](int t, int generation, float alpha) {
                 frame.start(*tile, t);
                 tile->fill({0.25f, 0.25f, 0.25f, alpha});
@@ -199,12 +195,11 @@ struct Hidden {
     }
 
     // If the image has depths, hidden inputs count as well.
-    template <class Transport>
-    static void withDepth(const typename Transport::Communicator& communicator, Result& result)
+    static void withDepth(const Transport::Communicator& communicator, Result& result)
     {
-        Fb<Transport> fb(communicator, config(true));
+        Fb fb(communicator, config(true));
         auto frame = fb.begin();
-        const auto tile = std::make_unique<typename Fb<Transport>::Tile>();
+        const auto tile = std::make_unique<typename Fb::Tile>();
         for (const int t : fb.ownedTiles()) {
             frame.start(*tile, t);
             tile->fill({0.5f, 0.25f, 0.125f, 1.0f});
@@ -216,14 +211,13 @@ struct Hidden {
         frame.end();
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
-        renderAll<Transport>(communicator, result);
-        byHand<Transport>(communicator, result);
-        waiting<Transport>(communicator, result);
-        withDepth<Transport>(communicator, result);
+        renderAll(communicator, result);
+        byHand(communicator, result);
+        waiting(communicator, result);
+        withDepth(communicator, result);
         return result;
     }
 };

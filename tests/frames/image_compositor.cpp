@@ -184,8 +184,7 @@ Expected expectedAt(int x, int y, int ranks, dfb::ImageBlend blend, bool hasStra
 }
 
 struct Images {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         const std::vector<Form> forms{{"8 bit", false, false, false, false},
                                       {"OpenGL", false, true, false, false},
@@ -275,8 +274,7 @@ struct Images {
 
 // 8-bit images travel as bytes and give the same picture as floats of the same values, bit for bit.
 struct BytesAndFloats {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
@@ -306,8 +304,7 @@ struct BytesAndFloats {
 
 // A pixel at infinite depth counts if it has a colour, in every form.
 struct AtInfinity {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
@@ -330,8 +327,7 @@ struct AtInfinity {
 
 // With FrameConfig::order no depth is sent. Pixels at farDepth are empty all the same: those of all ranks but the last.
 struct FarInOrder {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         dfb::ImageCompositor compositor(dfb::connect<Transport>(communicator), dfb::ImageBlend::ByDepth,
@@ -372,8 +368,7 @@ struct FarInOrder {
 
 // A rank that shows nothing needs no place in the order; one that shows something needs one.
 struct Places {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         dfb::ImageCompositor compositor(dfb::connect<Transport>(communicator), dfb::ImageBlend::InOrder,
@@ -396,8 +391,7 @@ struct Places {
 
 // Invalid images and other sizes: the error is the same on all ranks, and the next picture is right.
 struct Failures {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const dfb::FrameBufferConfig config(imageWidth, imageHeight); // with its default executor

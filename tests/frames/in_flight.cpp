@@ -10,8 +10,7 @@
 namespace frame_cases {
 
 struct TwoFrames {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         auto config = configOf(scene::makeScene(1), 2);
@@ -52,8 +51,7 @@ struct TwoFrames {
 
 // Frames of different loops, each begun before the frame before it has ended.
 struct LoopsInFlight {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5, 3);
@@ -93,8 +91,7 @@ struct LoopsInFlight {
 
 // Two framebuffers of different sizes and operations, over one connection.
 struct TwoFrameBuffers {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);

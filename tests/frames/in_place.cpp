@@ -126,17 +126,16 @@ dfb::FrameReport frameOf(FrameBuffer& fb, const RankImage& image, int passes,
 }
 
 struct InPlace {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
-        runOp<Transport, dfb::BasicAlphaBlend<16>>(connection, "AlphaBlend", result);
-        runOp<Transport, dfb::BasicDepthComposite<16>>(connection, "DepthComposite", result);
+        runOp<dfb::BasicAlphaBlend<16>>(connection, "AlphaBlend", result);
+        runOp<dfb::BasicDepthComposite<16>>(connection, "DepthComposite", result);
         return result;
     }
 
-    template <class Transport, class TileOp>
+    template <class TileOp>
     static void runOp(const std::shared_ptr<dfb::Connection>& connection, const std::string& op, Result& result)
     {
         for (const bool toBytes : {true, false}) {
@@ -186,8 +185,7 @@ struct InPlace {
 // With checksums: if a rank changes pixels that it promised to leave alone, the frame fails on all ranks with an error
 // that names the tile, and the next frame is good.
 struct BrokenPromise {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         dfb::NetworkConfig network;
@@ -236,8 +234,7 @@ struct Copies {
         bool isCopied_ = true;
     };
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         dfb::FrameBufferConfig config(inPlaceWidth, inPlaceHeight);

@@ -33,9 +33,7 @@ struct MovingBricks {
         return s;
     }
 
-    template <class Transport>
-    static void run(const typename Transport::Communicator& communicator, dfb::OutputFormat format, int threads,
-                    Result& result)
+    static void run(const Transport::Communicator& communicator, dfb::OutputFormat format, int threads, Result& result)
     {
         dfb::FrameBufferConfig config = configOf(sceneOf(0), threads);
         config.image.format = format;
@@ -66,16 +64,15 @@ struct MovingBricks {
         }
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
-        run<Transport>(communicator, dfb::OutputFormat::RGBA32F, 2, result);
-        run<Transport>(communicator, dfb::OutputFormat::RGBA8, 2, result);
+        run(communicator, dfb::OutputFormat::RGBA32F, 2, result);
+        run(communicator, dfb::OutputFormat::RGBA8, 2, result);
         const std::uint64_t before = result.hash;
         result.hash = 0;
-        run<Transport>(communicator, dfb::OutputFormat::RGBA32F, 0, result);
-        run<Transport>(communicator, dfb::OutputFormat::RGBA8, 0, result);
+        run(communicator, dfb::OutputFormat::RGBA32F, 0, result);
+        run(communicator, dfb::OutputFormat::RGBA8, 0, result);
         result.expect(result.hash == before, "images differ without workers");
         return result;
     }
@@ -223,8 +220,7 @@ struct ChangingDeclarations {
         return frame;
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicDeepBlend<16>, dfb::NoPixelOp, Transport>;
         Result result;

@@ -12,19 +12,17 @@ namespace frame_cases {
 
 namespace {
 
-template <class Transport>
 using OwnFrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport>;
 
 struct OwnLoop {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         scene::Scene s = scene::makeScene(5);
         s.passes = 2;
         auto config = scene::configOf(s);
         config.quiet = std::chrono::milliseconds(5);
-        OwnFrameBuffer<Transport> fb(communicator, config);
+        OwnFrameBuffer fb(communicator, config);
         const auto mine = scene::bricksOf(s, fb.rank(), fb.size());
         const auto meets = [&](const dfb::Brick& brick, int tile) {
             return !dfb::intersection(scene::FlatCamera().project(brick.bounds, s.width, s.height),

@@ -16,7 +16,7 @@
 
 namespace frame_cases {
 
-template <class Op, class Transport>
+template <class Op>
 using OpFrameBuffer = dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport>;
 
 // Without shared memory, each rank counts as a node of its own.
@@ -36,8 +36,7 @@ inline std::uint64_t hashOf(const dfb::Image& image)
 
 // Tiles move to other ranks and back, with and without a shared image, while the background changes as well.
 struct Moving {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene scenes[] = {scene::makeScene(3, 11), scene::makeScene(2, 5)};
@@ -45,8 +44,7 @@ struct Moving {
             for (const int inFlight : {1, 2}) {
                 dfb::FrameBufferConfig config = configOf(scenes[0], 2);
                 config.framesInFlight = inFlight;
-                OpFrameBuffer<dfb::BasicAlphaBlend<16>, Transport> fb(communicator, config,
-                                                                      isFar ? far() : dfb::NetworkConfig());
+                OpFrameBuffer<dfb::BasicAlphaBlend<16>> fb(communicator, config, isFar ? far() : dfb::NetworkConfig());
                 const std::string name = std::string(isFar ? "far" : "near") + ", " + std::to_string(inFlight);
                 result.expect(!isFar || fb.nodeOf()[static_cast<std::size_t>(fb.rank())] == fb.rank(),
                               name + ": memory is shared");
@@ -88,13 +86,12 @@ struct Moving {
 };
 
 struct Wrong {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         scene::Scene s = scene::makeScene(3, 6);
         s.timeout = std::chrono::milliseconds(5000); // nothing waits for it
-        OpFrameBuffer<dfb::BasicAlphaBlend<16>, Transport> fb(communicator, configOf(s, 1));
+        OpFrameBuffer<dfb::BasicAlphaBlend<16>> fb(communicator, configOf(s, 1));
         const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
         dfb::DataParallelLoop loop(fb, world);
         const int tiles = fb.layout().tileCount();
@@ -122,7 +119,7 @@ struct Wrong {
                       outcome);
         expect(frame(nullptr), "fine");
 
-        OpFrameBuffer<dfb::Progressive<dfb::AlphaBlend>, Transport> keeping(communicator, configOf(s, 1));
+        OpFrameBuffer<dfb::Progressive<dfb::AlphaBlend>> keeping(communicator, configOf(s, 1));
         dfb::FrameConfig params;
         params.owners = scene::anyOwners(keeping.layout(), keeping.size(), 1);
         expect(scene::outcomeOf([&] { keeping.begin(params).end(); }), "a tile operation that keeps state");
@@ -150,8 +147,8 @@ struct ByLinks {
     enum class Way { Data, Mixed, InOrder };
 
     // Returns the hashes of the images on the display rank, an empty list elsewhere. `bytes`: sent in all frames.
-    template <Way way, class Transport>
-    static std::vector<std::uint64_t> render(const typename Transport::Communicator& communicator, bool byLinks,
+    template <Way way>
+    static std::vector<std::uint64_t> render(const Transport::Communicator& communicator, bool byLinks,
                                              std::int64_t& bytes)
     {
         using Op = std::conditional_t<way == Way::InOrder, dfb::BasicOrderedBlend<16>, dfb::BasicAlphaBlend<16>>;
@@ -159,7 +156,7 @@ struct ByLinks {
         config.executor = std::make_shared<dfb::ThreadExecutor>(2);
         if (!byLinks)
             config.image.ownerMap = dfb::latticeOwner;
-        OpFrameBuffer<Op, Transport> fb(communicator, config, far());
+        OpFrameBuffer<Op> fb(communicator, config, far());
         dfb::World mine;
         const std::vector<dfb::Brick> all = boxes();
         for (std::size_t i = 0; i < all.size(); ++i) {
@@ -203,12 +200,12 @@ struct ByLinks {
         return hashes;
     }
 
-    template <Way way, class Transport>
-    static void compare(const typename Transport::Communicator& communicator, Result& result, const std::string& name)
+    template <Way way>
+    static void compare(const Transport::Communicator& communicator, Result& result, const std::string& name)
     {
         std::int64_t lattice = 0, byLinks = 0;
-        const auto expected = render<way, Transport>(communicator, false, lattice);
-        const auto got = render<way, Transport>(communicator, true, byLinks);
+        const auto expected = render<way>(communicator, false, lattice);
+        const auto got = render<way>(communicator, true, byLinks);
         result.expect(expected == got, name + ": another image");
         if (!got.empty())
             result.hash = scene::mix(result.hash ^ got.back());
@@ -217,13 +214,12 @@ struct ByLinks {
                       name + ": " + std::to_string(byLinks) + " bytes, " + std::to_string(lattice) + " by the lattice");
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
-        compare<Way::Data, Transport>(communicator, result, "data-parallel");
-        compare<Way::Mixed, Transport>(communicator, result, "mixed");
-        compare<Way::InOrder, Transport>(communicator, result, "in order");
+        compare<Way::Data>(communicator, result, "data-parallel");
+        compare<Way::Mixed>(communicator, result, "mixed");
+        compare<Way::InOrder>(communicator, result, "in order");
         return result;
     }
 };
@@ -233,9 +229,8 @@ struct Pictures {
     static constexpr int width = 400, height = 300;
 
     // Returns the hashes of the pictures. `bytes`: sent in all pictures from the second on.
-    template <class Transport>
-    static std::vector<std::uint64_t> render(const typename Transport::Communicator& communicator, bool isFar,
-                                             bool byLinks, Result& result, std::int64_t& bytes)
+    static std::vector<std::uint64_t> render(const Transport::Communicator& communicator, bool isFar, bool byLinks,
+                                             Result& result, std::int64_t& bytes)
     {
         dfb::FrameBufferConfig config(width, height, dfb::OutputFormat::RGBA32F);
         config.executor = std::make_shared<dfb::ThreadExecutor>(2);
@@ -274,14 +269,13 @@ struct Pictures {
         return hashes;
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         std::int64_t near = 0, lattice = 0, byLinks = 0;
-        const auto expected = render<Transport>(communicator, false, true, result, near);
-        result.expect(expected == render<Transport>(communicator, true, false, result, lattice), "lattice");
-        result.expect(expected == render<Transport>(communicator, true, true, result, byLinks), "by links");
+        const auto expected = render(communicator, false, true, result, near);
+        result.expect(expected == render(communicator, true, false, result, lattice), "lattice");
+        result.expect(expected == render(communicator, true, true, result, byLinks), "by links");
         result.expect(lattice == 0 || 10 * byLinks < 9 * lattice,
                       std::to_string(byLinks) + " bytes, " + std::to_string(lattice) + " by the lattice");
         return result;

@@ -65,8 +65,7 @@ void checkTiles(Result& result, const FrameBuffer& fb, const dfb::FrameReport& r
 }
 
 struct PartialFrames {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         for (const bool shared : {true, false}) {
@@ -173,8 +172,7 @@ private:
 };
 
 struct CancelledFrames {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         enum When { AtOnce, HalfWay, BeforeEnd, InEnd, Times };
         Result result;
@@ -220,8 +218,7 @@ struct CancelledFrames {
 
 // Which frame the image is of, if there is an image.
 struct ImageOfFrame {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5, 3);

@@ -28,8 +28,7 @@ void renderInRange(const scene::Scene& s, const dfb::Brick& brick, Tile& tile)
 }
 
 struct Precision {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5, 11);
@@ -105,8 +104,7 @@ struct Precision {
 
 // An input with an alpha outside [0, 1] is exact, but how much it lets through of rounded inputs is not known.
 struct AlphaOutside {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5, 11);
@@ -130,8 +128,7 @@ struct AlphaOutside {
 
 // HalfLevel: float images, and inputs that stay within a node, are exact. No 8-bit level is off by more than one.
 struct WithinHalfALevel {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5, 11);
@@ -195,8 +192,7 @@ struct WithinHalfALevel {
 // Channels other than colour do not depend on the colour's format, however thin a layer is. If all normals are equal,
 // their mean is the same normal.
 struct OtherChannels {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         using Op = dfb::BasicAlphaBlend<16, dfb::allChannels & ~dfb::farChannel>;
         Result result;
@@ -259,8 +255,7 @@ struct OtherChannels {
 
 // Invalid precisions are refused on all ranks.
 struct NoPrecision {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto [rank, size] = [&] {

@@ -64,8 +64,7 @@ struct MissingInputs {
         bool declared;
     };
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         constexpr int lost = 5; // the tile
         Result result;
@@ -137,8 +136,7 @@ struct MissingInputs {
 
 // Frames that must not be taken for quiet: good frames open beside one that misses inputs, and ranks that render long.
 struct QuietOthers {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5, 3);
@@ -208,8 +206,7 @@ struct QuietOthers {
 
 // A framebuffer whose tiles go to a wall.
 struct QuietWall {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
@@ -264,4 +261,7 @@ TEST_CASE("Other frames, other framebuffers and slow renderers are not taken for
     everywhere<frame_cases::QuietOthers>();
 }
 
-TEST_CASE("A wall whose frame misses an input does not wait for it", "[quiet]") { everywhere<frame_cases::QuietWall>(); }
+TEST_CASE("A wall whose frame misses an input does not wait for it", "[quiet]")
+{
+    everywhere<frame_cases::QuietWall>();
+}

@@ -35,8 +35,7 @@ void renderSample(const scene::Scene& s, const dfb::Brick& brick, Tile& tile)
 // ---- distributions ---------------------------------------------------------------------------------------------
 
 struct Distributions {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         using dfb::WorkDistribution;
         Result result;
@@ -74,8 +73,7 @@ struct Distributions {
 // Rank 0 is stuck in its first tile until the others have rendered more than their fair share. They can do so only if
 // jobs are handed out on demand. (Over MPI, ranks do not see each other's counts, so no rank is stuck.)
 struct Dynamic {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         static std::atomic<int> ofOthers{0};
         Result result;
@@ -112,8 +110,8 @@ struct Dynamic {
 
 // Frames of 3, 1 and 5 samples, some of which come later in some tiles, give the same image as one frame of 9 samples.
 struct Accumulation {
-    template <class Op, class Transport>
-    static void accumulate(const typename Transport::Communicator& communicator, Result& result, bool isData)
+    template <class Op>
+    static void accumulate(const Transport::Communicator& communicator, Result& result, bool isData)
     {
         scene::Scene s = isData ? scene::makeScene(6, 4, 61, 47, 9) : wholeScene(61, 47, 9);
         auto config = configOf(s, 2);
@@ -159,20 +157,18 @@ struct Accumulation {
         }
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
-        accumulate<dfb::Progressive<dfb::BasicImageParallel<16>>, Transport>(communicator, result, false);
-        accumulate<dfb::Progressive<dfb::BasicAlphaBlend<16>>, Transport>(communicator, result, true);
+        accumulate<dfb::Progressive<dfb::BasicImageParallel<16>>>(communicator, result, false);
+        accumulate<dfb::Progressive<dfb::BasicAlphaBlend<16>>>(communicator, result, true);
         return result;
     }
 };
 
 // If one rank accumulates on while the others begin again, all ranks get an error; then all can begin again.
 struct Reset {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = wholeScene(61, 47, 4);
@@ -256,7 +252,6 @@ struct NoisyScene {
     }
 };
 
-template <class Transport>
 using NoisyFrameBuffer =
     dfb::DistributedFrameBuffer<dfb::Progressive<dfb::BasicImageParallel<16>>, dfb::NoPixelOp, Transport>;
 
@@ -272,8 +267,7 @@ inline dfb::FrameBufferConfig configOf(const NoisyScene& s)
 
 // A noisy disc in front of a flat background: adaptive sampling is as accurate as uniform sampling, with fewer samples.
 struct Adaptive {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         NoisyScene s;
@@ -282,7 +276,7 @@ struct Adaptive {
             return r < 30 ? 0.2 + 0.02 * r : 1.0;
         };
         const dfb::Region all{0, 0, s.width, s.height};
-        NoisyFrameBuffer<Transport> fb(communicator, configOf(s));
+        NoisyFrameBuffer fb(communicator, configOf(s));
         std::atomic<std::int64_t> rendered{0};
         dfb::AdaptiveSampler sampler(fb.layout(), {0.03, 8, 512, 64});
         dfb::ImageParallelLoop inTurn(fb, dfb::WorkDistribution::RoundRobin);
@@ -295,7 +289,7 @@ struct Adaptive {
                 sampler.next()));
         const double error = fb.isDisplayRank() ? s.error(fb.image(), all) : 0;
         // All that was rendered was in the sampler's plans.
-        const std::int64_t tiles = fb.allReduce({rendered.load()}, NoisyFrameBuffer<Transport>::Reduce::Sum).front();
+        const std::int64_t tiles = fb.allReduce({rendered.load()}, NoisyFrameBuffer::Reduce::Sum).front();
         result.expect(tiles * 256 == sampler.samplesTaken(), "tiles were rendered for nothing");
         result.expect(sampler.samplesTaken() + sampler.samplesSaved()
                           == static_cast<std::int64_t>(s.width) * s.height * sampler.next().samples->at(27).first,
@@ -309,7 +303,7 @@ struct Adaptive {
         while (!uniform.done()) {
             uniform.update(owned.render([&](auto& tile) { s.render(tile); }, uniform.next()));
             const bool enough = fb.isDisplayRank() && s.error(fb.image(), all) <= error;
-            if (fb.allReduce({enough}, NoisyFrameBuffer<Transport>::Reduce::Max).front() != 0) {
+            if (fb.allReduce({enough}, NoisyFrameBuffer::Reduce::Max).front() != 0) {
                 needed = uniform.samplesTaken();
                 break;
             }
@@ -323,13 +317,12 @@ struct Adaptive {
 
 // A dark scene: each tile has one bright corner of 4x4 pixels, which few samples hit. No tile is given up too early.
 struct DarkCorners {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         NoisyScene s;
         s.probability = [](int x, int y) { return x % 16 >= 12 && y % 16 >= 12 ? 0.1 : 0.0; };
-        NoisyFrameBuffer<Transport> fb(communicator, configOf(s));
+        NoisyFrameBuffer fb(communicator, configOf(s));
         dfb::ImageParallelLoop loop(fb);
         const double maxError = 0.015;
         dfb::AdaptiveSampler sampler(fb.layout(), {maxError, 8, 4096, 64});

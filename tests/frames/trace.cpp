@@ -57,9 +57,8 @@ private:
 using TracedBlend = dfb::BasicAlphaBlend<16>;
 
 // A framebuffer with a sink. Without shared memory owners send their finished tiles, so all bytes are in messages.
-template <class Transport>
 struct Traced {
-    Traced(const typename Transport::Communicator& communicator, std::chrono::nanoseconds aheadByRank = {},
+    Traced(const Transport::Communicator& communicator, std::chrono::nanoseconds aheadByRank = {},
            int framesInFlight = 1)
     {
         dfb::NetworkConfig network;
@@ -153,11 +152,10 @@ bool areNested(Records records)
 
 // With two frames in flight, each figure that is both in the report and in the trace is the same in both.
 struct TraceAgrees {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
-        Traced<Transport> traced(communicator, {}, 2);
+        Traced traced(communicator, {}, 2);
         auto& fb = *traced.fb;
         std::vector<dfb::FrameReport> reports;
         for (std::uint64_t round = 0; round < 3; ++round) {
@@ -236,13 +234,12 @@ struct TraceAgrees {
 
 // The clocks of ranks are seconds apart, in either direction.
 struct ClocksApart {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         for (const std::chrono::nanoseconds ahead :
              {std::chrono::nanoseconds(1'234'567'891), -std::chrono::nanoseconds(77'000'000'003)}) {
-            Traced<Transport> traced(communicator, ahead);
+            Traced traced(communicator, ahead);
             const scene::Scene s = scene::makeScene(5, 3);
             const auto begin = std::chrono::steady_clock::now();
             auto frame = traced.fb->begin(paramsOf(s));
@@ -272,11 +269,10 @@ struct ClocksApart {
 
 // One frame that a rank aborts, one that a rank leaves without end(), and one that succeeds.
 struct FailedFramesEnd {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
-        Traced<Transport> traced(communicator);
+        Traced traced(communicator);
         auto& fb = *traced.fb;
         const bool isLast = fb.rank() == fb.size() - 1;
         const scene::Scene s = scene::makeScene(5, 3);

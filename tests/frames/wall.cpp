@@ -13,11 +13,11 @@
 
 namespace frame_cases {
 
-template <class TileOp, class PixelOp, class Transport>
+template <class TileOp, class PixelOp>
 using FrameBufferOf = dfb::DistributedFrameBuffer<TileOp, PixelOp, Transport>;
 
 struct Wall {
-    template <class TileOp, class Transport, class Render>
+    template <class TileOp, class Render>
     static void check(const std::shared_ptr<dfb::Connection>& connection, const dfb::WallLayout& layout,
                       dfb::OutputFormat format, Result& result, const std::string& name, const Render& render)
     {
@@ -25,9 +25,9 @@ struct Wall {
         dfb::DisplayWall wall(connection, layout, format, executor);
         dfb::FrameBufferConfig config = wall.frameBufferConfig();
         config.executor = executor;
-        FrameBufferOf<TileOp, dfb::ToWall, Transport> toWall(connection, config, {&wall});
+        FrameBufferOf<TileOp, dfb::ToWall> toWall(connection, config, {&wall});
         config.image.format = format;
-        FrameBufferOf<TileOp, dfb::NoPixelOp, Transport> single(connection, config);
+        FrameBufferOf<TileOp, dfb::NoPixelOp> single(connection, config);
         result.expect(wall.imageFrame() == -1, name + ": a frame before the first");
         for (int d = 0; d < layout.displayCount(); ++d)
             if (layout.ranks[static_cast<std::size_t>(d)] == single.rank())
@@ -69,8 +69,7 @@ struct Wall {
         }
     }
 
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
@@ -99,12 +98,12 @@ struct Wall {
             return dfb::ImageParallelLoop(fb, dfb::WorkDistribution::RoundRobin)
                 .render([&](auto& tile) { renderBrick(s, s.bricks[0], tile); }, paramsOfFrame(frame));
         };
-        check<dfb::BasicAlphaBlend<16>, Transport>(connection, dealt({2, 2, 40, 30, 0, 0, {}}, 0),
-                                                   dfb::OutputFormat::RGBA32F, result, "2x2", data);
-        check<dfb::BasicImageParallel<32>, Transport>(connection, dealt({3, 1, 25, 41, 7, 0, {}}, 1),
-                                                      dfb::OutputFormat::SRGBA8, result, "3x1 with bezels", image);
-        check<dfb::BasicAlphaBlend<16>, Transport>(connection, dealt({1, 5, 61, 9, 0, 40, {}}, 2),
-                                                   dfb::OutputFormat::RGBA8, result, "1x5 with wide bezels", data);
+        check<dfb::BasicAlphaBlend<16>>(connection, dealt({2, 2, 40, 30, 0, 0, {}}, 0), dfb::OutputFormat::RGBA32F,
+                                        result, "2x2", data);
+        check<dfb::BasicImageParallel<32>>(connection, dealt({3, 1, 25, 41, 7, 0, {}}, 1), dfb::OutputFormat::SRGBA8,
+                                           result, "3x1 with bezels", image);
+        check<dfb::BasicAlphaBlend<16>>(connection, dealt({1, 5, 61, 9, 0, 40, {}}, 2), dfb::OutputFormat::RGBA8,
+                                        result, "1x5 with wide bezels", data);
         dfb::WallLayout wrong = dealt({2, 2, 8, 8, 0, 0, {}}, 0);
         wrong.ranks[3] = size;
         const std::string outcome =
@@ -120,8 +119,7 @@ struct Wall {
 
 // A tile that converged long ago still appears on the wall, and a frame that failed leaves nothing there.
 struct WallProgressive {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
@@ -131,8 +129,8 @@ struct WallProgressive {
         auto config = wall.frameBufferConfig();
         config.executor = executor;
         using Op = dfb::Progressive<dfb::BasicImageParallel<16>>;
-        FrameBufferOf<Op, dfb::PixelOpChain<dfb::ToneMap, dfb::ToWall>, Transport> fb(
-            connection, config, {dfb::ToneMap{}, dfb::ToWall{&wall}});
+        FrameBufferOf<Op, dfb::PixelOpChain<dfb::ToneMap, dfb::ToWall>> fb(connection, config,
+                                                                           {dfb::ToneMap{}, dfb::ToWall{&wall}});
         dfb::AdaptiveSampler sampler(fb.layout(), {0.05, 2, 16, 4});
         dfb::ImageParallelLoop loop(fb);
         const auto render = [&](bool fails) {
@@ -183,8 +181,7 @@ struct WallProgressive {
 
 // The wall goes on after frames that are not finish()ed. Those that are come once each, in order.
 struct WallSkips {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
@@ -193,7 +190,7 @@ struct WallSkips {
         auto config = wall.frameBufferConfig();
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         config.image.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
-        FrameBufferOf<dfb::BasicImageParallel<16>, dfb::ToWall, Transport> fb(connection, config, {&wall});
+        FrameBufferOf<dfb::BasicImageParallel<16>, dfb::ToWall> fb(connection, config, {&wall});
         const auto reason = std::make_exception_ptr(std::runtime_error("a camera"));
         const auto show = [&](float shade) {
             dfb::FrameConfig params;

@@ -16,7 +16,6 @@ namespace frame_cases {
 
 namespace {
 
-template <class Transport>
 using WindowFrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport>;
 
 // Polls until the frame is done. Throws after 20 seconds.
@@ -34,8 +33,7 @@ dfb::FrameReport pollToEnd(Frame& frame, int& polls)
 }
 
 struct NotBlocking {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5);
@@ -44,9 +42,9 @@ struct NotBlocking {
             network.progress = progress;
             auto config = scene::configOf(s);
             config.quiet = std::chrono::minutes(1); // no good frame waits for this
-            WindowFrameBuffer<Transport> patient(communicator, config, network);
+            WindowFrameBuffer patient(communicator, config, network);
             config.quiet = std::chrono::milliseconds(5);
-            WindowFrameBuffer<Transport> fb(communicator, config, network);
+            WindowFrameBuffer fb(communicator, config, network);
             int polls = 0;
             for (int i = 0; i < 3; ++i) { // a good frame
                 const dfb::World world(scene::bricksOf(s, fb.rank(), fb.size()));
@@ -99,8 +97,7 @@ struct NotBlocking {
 
 // onTile is called once for each tile with an input, when its pixels are in the image.
 struct TilesAsTheyCome {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5);
@@ -116,7 +113,7 @@ struct TilesAsTheyCome {
             const float* row = image.rgba32f() + 4 * (pixels.y0 * image.width() + pixels.x0);
             rows[static_cast<std::size_t>(tile)].assign(row, row + 4 * pixels.width());
         };
-        WindowFrameBuffer<Transport> fb(communicator, config);
+        WindowFrameBuffer fb(communicator, config);
         for (int i = 0; i < 2; ++i) {
             for (auto& count : told)
                 count = 0;
@@ -159,15 +156,14 @@ struct TilesAsTheyCome {
 };
 
 struct Sizes {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         scene::Scene s = scene::makeScene(5);
         for (const int inFlight : {1, 2}) {
             auto config = scene::configOf(s);
             config.framesInFlight = inFlight;
-            WindowFrameBuffer<Transport> fb(communicator, config);
+            WindowFrameBuffer fb(communicator, config);
             const auto expectRight = [&](const scene::Scene& its, const std::string& when) {
                 const auto report = scene::renderLoop(fb, its, scene::Loop::Declared);
                 if (fb.isDisplayRank())
@@ -196,17 +192,16 @@ struct Sizes {
 
 // imageOnAllRanks() gives every rank the image with its depth, or an empty image if there is none.
 struct EverywhereTheImage {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         const scene::Scene s = scene::makeScene(5);
         for (const int display : {0, 1}) {
             auto config = scene::configOf(s);
             config.image.depth = true;
-            WindowFrameBuffer<Transport> probe(communicator, config);
+            WindowFrameBuffer probe(communicator, config);
             config.image.displayRank = std::min(display, probe.size() - 1);
-            WindowFrameBuffer<Transport> fb(communicator, config);
+            WindowFrameBuffer fb(communicator, config);
             result.expect(fb.imageOnAllRanks().empty(), "an image before the first frame");
             const auto report = scene::renderLoop(fb, s, scene::Loop::Declared);
             const dfb::Image image = fb.imageOnAllRanks();
@@ -226,14 +221,13 @@ struct EverywhereTheImage {
 // A frame of a region renders the tiles that meet the region. The others keep their pixels, even if the scene has
 // changed.
 struct RegionOfInterest {
-    template <class Transport>
-    static Result run(const typename Transport::Communicator& communicator)
+    static Result run(const Transport::Communicator& communicator)
     {
         Result result;
         scene::Scene first = scene::makeScene(5), second = scene::makeScene(6);
         second.width = first.width, second.height = first.height;
         second.background = {0.5f, 0.25f, 0.125f, 1}; // shows in the region only
-        WindowFrameBuffer<Transport> fb(communicator, scene::configOf(first));
+        WindowFrameBuffer fb(communicator, scene::configOf(first));
         const dfb::Region region{20, 17, 41, 33};
         const auto render = [&](const scene::Scene& s, bool all) {
             const dfb::World world(scene::bricksOf(s, fb.rank(), fb.size()));

@@ -1,8 +1,8 @@
 // Everywhere: runs a case on several numbers of ranks in one process (test_inproc), or on all ranks of MPI and on one
 // rank in this process (test_mpi). All images must be the same bit for bit.
 //
-// A case has   template <class Transport> static Result run(const typename Transport::Communicator&);
-// It is called on each rank, must not use Catch, and takes at most a second. Transport is AnyTransport.
+// A case has   static Result run(const Transport::Communicator&);
+// It is called on each rank, must not use Catch, and takes at most a second.
 #pragma once
 
 #include "any_transport.hpp"
@@ -27,7 +27,8 @@ struct Result {
     }
 };
 
-using Run = Result (*)(const AnyTransport::Communicator&);
+using Transport = AnyTransport; // of all cases
+using Run = Result (*)(const Transport::Communicator&);
 
 // Returns the result of rank 0, with the errors of all ranks.
 inline Result inProcess(Run run, int ranks)
@@ -61,11 +62,11 @@ void runEverywhere(Run run, bool atOnce);
 template <class Case>
 void everywhere()
 {
-    frame_cases::runEverywhere(&Case::template run<AnyTransport>, false);
+    frame_cases::runEverywhere(&Case::run, false);
 }
 
 template <class Case>
 void everywhereAtOnce()
 {
-    frame_cases::runEverywhere(&Case::template run<AnyTransport>, true);
+    frame_cases::runEverywhere(&Case::run, true);
 }
