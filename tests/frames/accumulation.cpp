@@ -88,8 +88,7 @@ dfb::FrameReport render(FrameBuffer& fb, Loop loop, const scene::Scene& s, const
             for (int pass = 0; !isDeclared && pass < params.passes; ++pass) {
                 frame.start(*tile, index, pass);
                 for (const dfb::Brick& b : s.bricks)
-                    tile->children +=
-                        !dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), tile->region).empty();
+                    tile->children += scene::meets(fb, b, index);
                 frame.setTile(*tile);
             }
         try {

@@ -289,11 +289,6 @@ private:
         return world;
     }
 
-    bool meets(const dfb::Brick& b, int tile) const
-    {
-        return !dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), fb_.layout().region(tile)).empty();
-    }
-
     void expect(bool condition, const std::string& what) { result_.expect(condition, prefix() + what); }
     std::string prefix() const { return "loop " + std::to_string(static_cast<int>(loop_)) + ", " + name_ + ": "; }
 
@@ -512,9 +507,9 @@ private:
                 inputs.push_back(
                     {tile, nullptr,
                      static_cast<int>(std::count_if(s.bricks.begin(), s.bricks.end(),
-                                                    [&](const dfb::Brick& b) { return meets(b, tile); }))});
+                                                    [&](const dfb::Brick& b) { return scene::meets(fb_, b, tile); }))});
             for (const dfb::Brick& b : mine_)
-                if (meets(b, tile))
+                if (scene::meets(fb_, b, tile))
                     inputs.push_back({tile, &b, 0});
         }
         Frame frame = begin(params);
@@ -660,7 +655,7 @@ private:
             about.clear();
             for (int tile = 0; tile < fb_.layout().tileCount(); ++tile)
                 if (std::none_of(good_.bricks.begin(), good_.bricks.end(),
-                                 [&](const dfb::Brick& b) { return meets(b, tile); }))
+                                 [&](const dfb::Brick& b) { return scene::meets(fb_, b, tile); }))
                     about.insert(tile);
         }
         if (fault.kind == NewFrame || fault.kind == Add || fault.kind == Finish || fault.kind == Process

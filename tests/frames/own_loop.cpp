@@ -24,24 +24,19 @@ struct OwnLoop {
         config.quiet = std::chrono::milliseconds(5);
         OwnFrameBuffer fb(communicator, config);
         const auto mine = scene::bricksOf(s, fb.rank(), fb.size());
-        const auto meets = [&](const dfb::Brick& brick, int tile) {
-            return !dfb::intersection(scene::FlatCamera().project(brick.bounds, s.width, s.height),
-                                      fb.layout().region(tile))
-                        .empty();
-        };
         // Calls `check(tile)` for each input before it is sent. The loop has two kinds of jobs: the backgrounds of this
         // rank's tiles, and its bricks in all tiles.
         const auto render = [&](dfb::FrameConfig params, const auto& check) {
             auto frame = fb.begin(params);
             frame.forEachTile(fb.ownedTiles(), [&](auto& tile) {
                 for (const dfb::Brick& brick : s.bricks)
-                    tile.children += meets(brick, tile.tile);
+                    tile.children += scene::meets(fb, brick, tile.tile);
                 frame.setTile(tile);
             });
             std::vector<dfb::BrickInTile> jobs;
             for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
                 for (std::size_t b = 0; b < mine.size(); ++b)
-                    if (meets(mine[b], tile))
+                    if (scene::meets(fb, mine[b], tile))
                         jobs.push_back({static_cast<int>(b), tile});
             frame.forEachTile(static_cast<std::int64_t>(jobs.size()), [&](std::int64_t i, auto& tile) {
                 const dfb::BrickInTile& job = jobs[static_cast<std::size_t>(i)];
@@ -65,7 +60,7 @@ struct OwnLoop {
         expectRight("a wrong picture");
 
         int bad = 0; // a tile with an input
-        while (!meets(s.bricks.front(), bad))
+        while (!scene::meets(fb, s.bricks.front(), bad))
             ++bad;
         const auto throws = [&](const dfb::TileHeader& tile) {
             if (tile.tile == bad)

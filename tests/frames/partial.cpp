@@ -79,9 +79,8 @@ struct PartialFrames {
             params.allowPartial = true;
             const auto mine = bricksOf(s, fb.rank(), fb.size());
             // `lost`: the first tile that meets the first brick.
-            const dfb::Region box = scene::FlatCamera().project(s.bricks[0].bounds, 0, 0);
             int lost = 0;
-            while (dfb::intersection(box, fb.layout().region(lost)).empty())
+            while (!scene::meets(fb, s.bricks[0], lost))
                 ++lost;
             constexpr int never = 20000, soon = 2000; // ms; even if busy, enough for all that is not lost
             const dfb::World world(mine);
@@ -135,12 +134,12 @@ struct PartialFrames {
                     if (index != lost && fb.tileOwner(index) == fb.rank()) {
                         open.start(*tile, index);
                         for (const dfb::Brick& b : s.bricks)
-                            tile->children += meets(fb, b, index);
+                            tile->children += scene::meets(fb, b, index);
                         open.setTile(*tile);
                     }
                 for (int index = 0; index < fb.layout().tileCount(); ++index)
                     for (const dfb::Brick& b : mine)
-                        if (index != lost && meets(fb, b, index)) {
+                        if (index != lost && scene::meets(fb, b, index)) {
                             open.start(*tile, index);
                             tile->generation = 1;
                             tile->source = b.id;
@@ -161,13 +160,6 @@ struct PartialFrames {
             isFine("the last");
         }
         return result;
-    }
-
-private:
-    template <class FrameBuffer>
-    static bool meets(const FrameBuffer& fb, const dfb::Brick& b, int index)
-    {
-        return !dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), fb.layout().region(index)).empty();
     }
 };
 

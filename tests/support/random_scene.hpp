@@ -31,6 +31,13 @@ struct FlatCamera {
     }
 };
 
+// Whether a brick may have pixels of a tile.
+template <class FrameBuffer>
+bool meets(const FrameBuffer& fb, const dfb::Brick& brick, int tile)
+{
+    return !dfb::intersection(FlatCamera().project(brick.bounds, 0, 0), fb.layout().region(tile)).empty();
+}
+
 struct Scene {
     int width = 97, height = 61; // primes
     int passes = 1;
@@ -161,20 +168,16 @@ dfb::FrameReport listing3(FrameBuffer& fb, const Scene& s, const std::vector<dfb
 {
     auto frame = fb.begin(paramsOf(s));
     const auto tile = std::make_unique<typename FrameBuffer::Tile>();
-    const auto meets = [&](const dfb::Brick& brick, int index) {
-        return !dfb::intersection(FlatCamera().project(brick.bounds, s.width, s.height), fb.layout().region(index))
-                    .empty();
-    };
     for (int pass = 0; pass < s.passes; ++pass) {
         for (int index : frame.ownedTiles()) {
             frame.start(*tile, index, pass);
-            tile->children = static_cast<int>(
-                std::count_if(s.bricks.begin(), s.bricks.end(), [&](const dfb::Brick& b) { return meets(b, index); }));
+            tile->children = static_cast<int>(std::count_if(s.bricks.begin(), s.bricks.end(),
+                                                            [&](const dfb::Brick& b) { return meets(fb, b, index); }));
             frame.setTile(*tile);
         }
         for (int index = 0; index < fb.layout().tileCount(); ++index)
             for (const dfb::Brick& brick : mine)
-                if (meets(brick, index)) {
+                if (meets(fb, brick, index)) {
                     frame.start(*tile, index, pass);
                     tile->generation = 1;
                     tile->source = brick.id;

@@ -13,18 +13,15 @@ void sendAll(FrameBuffer& fb, Frame& frame, const scene::Scene& s, bool second)
 {
     const auto mine = bricksOf(s, fb.rank(), fb.size());
     const auto tile = std::make_unique<typename FrameBuffer::Tile>();
-    const auto meets = [&](const dfb::Brick& b, int index) {
-        return !dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), fb.layout().region(index)).empty();
-    };
     for (int index = second ? 1 : 0; index < fb.layout().tileCount(); index += 2) { // even or odd tiles
         if (fb.tileOwner(index) == fb.rank()) {
             frame.start(*tile, index);
             for (const dfb::Brick& b : s.bricks)
-                tile->children += meets(b, index);
+                tile->children += scene::meets(fb, b, index);
             frame.setTile(*tile);
         }
         for (const dfb::Brick& b : mine)
-            if (meets(b, index)) {
+            if (scene::meets(fb, b, index)) {
                 frame.start(*tile, index);
                 tile->generation = 1;
                 tile->source = b.id;

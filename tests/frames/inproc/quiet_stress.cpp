@@ -124,8 +124,7 @@ Outcome frames(std::uint64_t seed, int ranks, int threads, int inFlight, int cou
             std::vector<dfb::TileInput> inputs;
             for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
                 for (const dfb::Brick& b : mine)
-                    if (!dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), fb.layout().region(tile))
-                             .empty())
+                    if (scene::meets(fb, b, tile))
                         inputs.push_back({tile, b.id, 0});
             const bool declaresFirst = own() % 2 == 0;
             if (declaresFirst)
