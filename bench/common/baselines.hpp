@@ -112,11 +112,10 @@ public:
         if (Clock::now() - since_ > std::chrono::microseconds(5))
             std::this_thread::sleep_for(std::chrono::microseconds(50));
     }
-    void busy() { since_ = Clock::now(); }
 
 private:
     Waiting waiting_;
-    Clock::time_point since_ = Clock::now();
+    const Clock::time_point since_ = Clock::now();
 };
 
 inline void complete(MPI_Request& request, Waiting waiting)

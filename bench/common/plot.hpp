@@ -1,10 +1,11 @@
 // A picture of some lines over a common axis, as SVG.
 #pragma once
 
+#include "figures.hpp"
+
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <cstdio>
 #include <fstream>
 #include <stdexcept>
 #include <string>
@@ -49,11 +50,7 @@ inline void writePlot(const std::string& path, const std::string& title, const s
         svg << "<line x1=\"" << ax << "\" y1=\"" << ay << "\" x2=\"" << bx << "\" y2=\"" << by
             << "\" stroke=\"#ddd\"/>\n";
     };
-    const auto number = [](double v) {
-        char text[32];
-        std::snprintf(text, sizeof text, "%.6g", v);
-        return std::string(text);
-    };
+    const auto number = [](double v) { return text("%.6g", v); };
     const auto marks = [&](double low, double high, bool powersOfTwo) {
         std::vector<double> at;
         if (!isLogarithmic)

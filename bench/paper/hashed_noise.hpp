@@ -46,9 +46,6 @@ class HashedNoise {
 public:
     explicit HashedNoise(std::uint32_t seed) : seed_(seed) {}
 
-    // One octave, of wavelength 1; about -1 to 1.
-    float operator()(const dfb::Vec3& p) const { return octave(p, seed_); }
-
     // Octaves of `frequency` and up, each about twice as fine and `gain` times as strong as the one before: turbulence.
     float turbulence(const dfb::Vec3& p, float frequency, int octaves, float gain = 0.5f) const
     {

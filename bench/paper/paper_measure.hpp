@@ -37,10 +37,8 @@ struct Measurement {
                       overhead.deviation, busiest.median);
         text += more;
         const auto append = [&](const std::vector<double>& values) {
-            for (std::size_t v = 0; v < values.size(); ++v) {
-                std::snprintf(more, sizeof more, "%s%.3f", v == 0 ? "" : ", ", values[v]);
-                text += more;
-            }
+            for (std::size_t v = 0; v < values.size(); ++v)
+                text += (v == 0 ? "" : ", ") + bench::text("%.3f", values[v]);
         };
         append(views);
         text += "], \"view_busiest_cpu_ms\": [";

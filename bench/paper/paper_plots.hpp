@@ -7,7 +7,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <cstdio>
 #include <fstream>
 #include <set>
 #include <stdexcept>
@@ -159,12 +158,7 @@ private:
         static const char* const all[] = {"#0a58a8", "#c03020", "#2e8540", "#8a5a00", "#6a3d9a", "#607050"};
         return all[static_cast<std::size_t>(i) % 6];
     }
-    static std::string number(double v)
-    {
-        char out[32];
-        std::snprintf(out, sizeof out, "%g", v);
-        return out;
-    }
+    static std::string number(double v) { return bench::text("%g", v); }
     // Of marks: 1, 2 or 5 times a power of 10, between 4 and 10 of them.
     static double stepOf(double range)
     {
