@@ -127,8 +127,15 @@ public:
         }
         if (!block && shared)
             block = shared->take(bytesOf(c));
-        if (!block)
-            block = fromSystem(c);
+        try {
+            if (!block)
+                block = static_cast<std::byte*>(::operator new (bytesOf(c), std::align_val_t{alignment}));
+        } catch (const std::bad_alloc&) {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            --sizeClass.blocks;
+            heldBytes_ -= bytesOf(c);
+            throw OutOfMemory(bytesOf(c), "a block");
+        }
         return Buffer(shared_from_this(), block, byteCount, c);
     }
 
@@ -193,18 +200,6 @@ private:
         if (c == classCount)
             throw OutOfMemory(byteCount, "a block");
         return c;
-    }
-
-    std::byte* fromSystem(int c)
-    {
-        try {
-            return static_cast<std::byte*>(::operator new (bytesOf(c), std::align_val_t{alignment}));
-        } catch (const std::bad_alloc&) {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            --classes_[static_cast<std::size_t>(c)].blocks;
-            heldBytes_ -= bytesOf(c);
-            throw OutOfMemory(bytesOf(c), "a block");
-        }
     }
 
     // A block that was lent and is back, or null. Looks at a few only.

@@ -281,12 +281,6 @@ struct FrameDataOf<T, std::void_t<typename T::FrameData>> {
     using type = typename T::FrameData;
 };
 
-template <class T, class = void>
-inline constexpr bool has_channels_v = false;
-template <class T>
-inline constexpr bool has_channels_v<T, std::void_t<decltype(T::channels)>> =
-    std::is_convertible_v<decltype(T::channels), ChannelMask>;
-
 DFB_SETTING(int, tile_size_v, 64, tileSize);
 DFB_SETTING(ChannelMask, needed_channels_v, T::channels, neededChannels);
 DFB_SETTING(bool, active_by_depth_v, false, activeByDepth);
@@ -303,12 +297,9 @@ DFB_DETECTS(has_add_v, std::declval<T&>().add(std::declval<Fragment&&>()));
 DFB_DETECTS(has_finish_v, std::declval<T&>().finish(std::declval<FinishedTile&>()));
 DFB_DETECTS(opaque_hides_v, T::opaqueHides(std::declval<const TileInfo&>()));
 DFB_DETECTS(has_report_v, std::declval<const T&>().report(std::declval<TileReport&>()));
-
-template <class T, class = void>
-inline constexpr bool has_is_complete_v = false;
-template <class T>
-inline constexpr bool has_is_complete_v<T, std::void_t<decltype(std::declval<const T&>().isComplete())>> =
-    std::is_same_v<bool, decltype(std::declval<const T&>().isComplete())>;
+DFB_DETECTS(has_channels_v, std::enable_if_t<std::is_convertible_v<decltype(T::channels), ChannelMask>, bool>{});
+DFB_DETECTS(has_is_complete_v,
+            std::enable_if_t<std::is_same_v<bool, decltype(std::declval<const T&>().isComplete())>, bool>{});
 
 } // namespace detail
 

@@ -64,11 +64,11 @@ public:
             compositeSpans(row);
         } else {
             findEdges(width);
-            if (rule_ == BlendRule::InOrder && !wantsAux && row.rgbaLow.empty() && areRunsShort()) {
+            const int pixels = edges_[edgeCount_ - 1] - edges_.front(), runs = static_cast<int>(edgeCount_ - 1);
+            if (rule_ == BlendRule::InOrder && !wantsAux && row.rgbaLow.empty() && pixels < shortRun * runs)
                 compositeLayers(row);
-            } else {
+            else
                 compositeRuns(row, wantsAux);
-            }
         }
     }
 
@@ -262,11 +262,6 @@ private:
             end = span->x + span->count;
         }
         clearGap(row, end, static_cast<int>(row.transmittance.size()));
-    }
-
-    bool areRunsShort() const
-    {
-        return edges_[edgeCount_ - 1] - edges_.front() < shortRun * static_cast<int>(edgeCount_ - 1);
     }
 
     // For fragments in order: blends one after the other, each under what is there. That begins one run per span, where

@@ -457,8 +457,7 @@ public:
 
     // Calls make(), which makes or adds this rank's part of a collective call. If it lacks memory, the connection fails
     // on all ranks, as the others would wait for the part; and this throws std::bad_alloc.
-    template <class Make>
-    void makePart(const Make& make)
+    void makePart(FunctionRef<void()> make)
     {
         try {
             make();
@@ -701,23 +700,21 @@ private:
             const std::lock_guard<std::mutex> lock(mutex_);
             inbox_.push({source, header, std::move(message)});
         }
-        submit([](Mailbox& self) {
-            std::unique_lock<std::mutex> lock(self.mutex_);
-            Arrival next = self.inbox_.pop();
-            lock.unlock();
-            self.dispatch(std::move(next));
-        });
+        submit([](Mailbox& self) { self.dispatch(); });
     }
 
-    void dispatch(Arrival&& a)
+    void dispatch()
     {
+        std::unique_lock<std::mutex> lock(mutex_);
+        Arrival a = inbox_.pop();
+        lock.unlock();
         TraceSpan span(trace_, TraceEvent::Kind::Receive, epoch_);
         trace(span, a.source, a.header, a.message);
         try {
             if (a.header.kind == MessageKind::Leaving) {
                 const Left left{a.source, a.header.number, bodyOf<Leaving>(a.message)};
                 {
-                    const std::lock_guard<std::mutex> lock(mutex_);
+                    const std::lock_guard<std::mutex> leftLock(mutex_);
                     left_.push_back(left);
                 }
                 checkLeft();

@@ -462,14 +462,6 @@ DFB_COMPILED_ONCE void FragmentStore::finishRuns(FinishedTile& out)
     }
 }
 
-inline bool areOpaque(const std::byte* rgba, int count)
-{
-    std::byte all{255};
-    for (int i = 0; i < count; ++i)
-        all &= rgba[4 * i + 3];
-    return all == std::byte{255};
-}
-
 // Finishes a tile of DepthComposite whose inputs have 8 bits a channel. An image of 8 bits gets their pixels as they
 // are where no background shows through.
 DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
@@ -487,7 +479,7 @@ DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
         };
         forEachRunOfRow(out, y, background, bitsOf, [&](int x, int count) {
             const std::byte* bytes = scratch.nearest.bytes.data() + 4 * x;
-            if (out.format() == OutputFormat::RGBA8 && (isBlack || areOpaque(bytes, count))) {
+            if (out.format() == OutputFormat::RGBA8 && (isBlack || isOpaque(bytes, true, count, 1, 0))) {
                 out.setStored(x, y, count, bytes, depth + x);
                 return;
             }
