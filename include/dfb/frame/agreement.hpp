@@ -2,6 +2,7 @@
 // configuration.
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/frame.hpp>
@@ -243,8 +244,7 @@ inline void checkConfig(const FrameBufferConfig& c, const OperationTraits& opera
 // Collective. Throws InvalidArgument on all ranks if the configurations differ or makeMine() throws on any rank. No
 // rank throws before all know the reason: the first to throw may destroy the connection, and a rank that has not heard
 // the reason by then would report another error.
-template <class MakeMine>
-Agreement agree(Mailbox& mailbox, const MakeMine& makeMine)
+inline Agreement agree(Mailbox& mailbox, FunctionRef<Agreement()> makeMine)
 {
     Agreement mine;
     try {

@@ -586,8 +586,11 @@ private:
     // The message that tells the owner where the pixels lie. Empty if it does not see them.
     Buffer encodePlace(const InputPixels& tile, int owner)
     {
-        const auto offsetOf = [this](const std::byte* address) { return mailbox_->connection().offsetOf(address); };
-        return mailbox_->connection().isSeenBy(owner) ? pipeline_->encodePlace(tile, offsetOf) : Buffer();
+        const Connection& connection = mailbox_->connection();
+        const auto offsetOf = [&](const std::byte* address) { return connection.offsetOf(address); };
+        return connection.isSeenBy(owner)
+                   ? encodeInPlace(*pool_, tile, pipeline_->sent() | colorChannel, mailbox_->address(), offsetOf)
+                   : Buffer();
     }
 
     // Takes the message with an input from rank `source`.

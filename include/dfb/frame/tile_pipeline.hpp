@@ -202,14 +202,6 @@ public:
                && tile.planes.at[Color] && !tile.valid.empty();
     }
 
-    // Returns the message for such a tile if another rank owns it. `offsetOf(address)`: the offset from the start of
-    // the memory that the owner sees, or -1. The message is empty if the pixels do not lie in that memory.
-    template <class OffsetOf>
-    Buffer encodePlace(const InputPixels& tile, const OffsetOf& offsetOf)
-    {
-        return encodeInPlace(*pool_, tile, sent_ | colorChannel, address_, offsetOf);
-    }
-
     // Returns the input for such a tile if this rank owns it.
     Fragment inputOf(const InputPixels& tile)
     {

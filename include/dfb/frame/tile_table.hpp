@@ -316,23 +316,18 @@ private:
         return slot && slot->frame == info_.frame;
     }
 
-    std::unique_ptr<Slot> takeSpare()
-    {
-        const std::lock_guard<std::mutex> lock(spareMutex_);
-        if (spare_.empty())
-            return nullptr;
-        auto slot = std::move(spare_.back());
-        spare_.pop_back();
-        return slot;
-    }
-
     // Returns the slot, set up for this frame. The first call in a frame throws the exceptions of the op's constructor
     // and of its newFrame(): then the tile is spoilt.
     Slot& slotFor(int tile)
     {
         auto& slot = slotOf(tile);
-        if (!slot)
-            slot = takeSpare();
+        if (!slot) {
+            const std::lock_guard<std::mutex> lock(spareMutex_);
+            if (!spare_.empty()) {
+                slot = std::move(spare_.back());
+                spare_.pop_back();
+            }
+        }
         if (!slot)
             slot = std::make_unique<Slot>();
         if (slot->frame != info_.frame) {

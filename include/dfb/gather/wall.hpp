@@ -5,7 +5,6 @@
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/exec.hpp>
 #include <dfb/frame/agreement.hpp>
-#include <dfb/fwd.hpp>
 #include <dfb/image.hpp>
 #include <dfb/pixel_op.hpp>
 #include <dfb/tile_layout.hpp>
