@@ -162,7 +162,8 @@ public:
         if (bound <= 0)
             throw std::runtime_error("--live: port " + std::to_string(std::max(0, port))
                                      + " of 127.0.0.1 cannot be had: is something else listening there?");
-        url_ = std::string("http://") + here + ':' + std::to_string(bound) + "/?token=" + token_;
+        port_ = std::to_string(bound);
+        url_ = std::string("http://") + here + ':' + port_ + "/?token=" + token_;
         listener_ = std::thread([this] {
             http_.listen_after_bind();
             hasListened_ = true;
@@ -184,6 +185,15 @@ public:
     }
 
     const std::string& url() const override { return url_; }
+
+    std::string invitation() const override
+    {
+        char host[256] = "";
+        if (gethostname(host, sizeof host - 1) != 0)
+            std::snprintf(host, sizeof host, "HOST");
+        return "look at it in a browser on this machine: " + url_ + "\nfrom another machine, first run there: ssh -L "
+               + port_ + ":127.0.0.1:" + port_ + ' ' + host + '\n';
+    }
 
     void open(const LiveScene& scene, const LiveWishes& home) override
     {
@@ -533,7 +543,7 @@ private:
 
     const std::string title_, token_ = randomToken();
     const bool hasSteps_;
-    std::string url_;
+    std::string port_, url_;
 
     mutable std::mutex mutex_; // guards what follows
     mutable std::condition_variable changed_;
@@ -559,17 +569,6 @@ private:
 };
 
 } // namespace
-
-std::string LiveView::invitation() const
-{
-    char host[256] = "";
-    if (gethostname(host, sizeof host - 1) != 0)
-        std::snprintf(host, sizeof host, "HOST");
-    const std::size_t begin = url().rfind(':') + 1;
-    const std::string port = url().substr(begin, url().find('/', begin) - begin);
-    return "look at it in a browser on this machine: " + url() + "\nfrom another machine, first run there: ssh -L "
-           + port + ":127.0.0.1:" + port + ' ' + host + '\n';
-}
 
 std::unique_ptr<LiveView> LiveView::listen(const std::string& title, int port, bool hasSteps)
 {

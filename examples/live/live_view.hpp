@@ -81,7 +81,7 @@ public:
     // The address to open in a browser on this machine.
     virtual const std::string& url() const = 0;
     // Two lines to print: the address, and the command that makes it reachable from another machine.
-    std::string invitation() const;
+    virtual std::string invitation() const = 0;
 
     // Viewers may have wishes from now on; `home` is what is shown until they have.
     virtual void open(const LiveScene& scene, const LiveWishes& home) = 0;

@@ -11,6 +11,4 @@ std::unique_ptr<LiveView> LiveView::listen(const std::string&, int, bool)
                              "missing: " DFB_LIVE_MISSING);
 }
 
-std::string LiveView::invitation() const { return {}; } // there is no view
-
 } // namespace example

@@ -230,7 +230,7 @@ struct BlamedCalls {
     {
         using Fb = BlameFrameBuffer;
         using Call = std::pair<std::string, std::function<void(Fb&)>>; // and its name in errors
-        const auto reduce = [](typename Fb::Reduce how) { return [how](Fb& fb) { fb.allReduce({1}, how); }; };
+        const auto reduce = [](Fb::Reduce how) { return [how](Fb& fb) { fb.allReduce({1}, how); }; };
         const Call sum{"allReduce() of 1 values to their sum", reduce(Fb::Reduce::Sum)},
             largest{"allReduce() of 1 values to their maximum", reduce(Fb::Reduce::Max)},
             share{"SharedWorld()", [](Fb&fb) { dfb::SharedWorld(fb, dfb::World()); }},
@@ -270,7 +270,7 @@ struct BlamedTree {
         const scene::Scene s = scene::makeScene(3);
         Fb fb(communicator, configOf(s));
         const int size = fb.size(), owner = fb.tileOwner(5);
-        const auto tile = std::make_unique<typename Fb::Tile>();
+        const auto tile = std::make_unique<Fb::Tile>();
         {
             // The owner announces inputs that never come.
             dfb::FrameConfig params;
@@ -364,7 +364,7 @@ struct BlamedLoop {
         Result result;
         const scene::Scene s = scene::makeScene(3);
         Fb fb(communicator, configOf(s));
-        const auto tile = std::make_unique<typename Fb::Tile>();
+        const auto tile = std::make_unique<Fb::Tile>();
         for (const int culprit : {0, fb.size() / 2, fb.size() - 1})
             for (const bool named : {false, true}) {
                 std::int64_t number = 0;

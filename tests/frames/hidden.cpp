@@ -105,7 +105,7 @@ struct Hidden {
         const int other = 1 % fb.size();
         for (int round = 0; round < 3; ++round) {
             auto frame = fb.begin();
-            const auto tile = std::make_unique<typename Fb::Tile>();
+            const auto tile = std::make_unique<Fb::Tile>();
             for (const auto& [t, generation] : {std::pair{0, 0}, {-1, 1}, {fb.layout().tileCount(), 1}}) {
                 const std::string text = scene::outcomeOf([&, t = t, g = generation] { frame.hide(t, g, fb.rank()); });
                 result.expect(scene::has(text, "InvalidArgument"), "what is no input is hidden: " + text);
@@ -150,7 +150,7 @@ struct Hidden {
         const int other = 1 % fb.size(), tiles = fb.layout().tileCount();
         for (const bool isSilent : {false, true}) {
             auto frame = fb.begin();
-            const auto tile = std::make_unique<typename Fb::Tile>();
+            const auto tile = std::make_unique<Fb::Tile>();
             const auto set = [&](int t, int generation, float alpha) {
                 frame.start(*tile, t);
                 tile->fill({0.25f, 0.25f, 0.25f, alpha});
@@ -199,7 +199,7 @@ struct Hidden {
     {
         Fb fb(communicator, config(true));
         auto frame = fb.begin();
-        const auto tile = std::make_unique<typename Fb::Tile>();
+        const auto tile = std::make_unique<Fb::Tile>();
         for (const int t : fb.ownedTiles()) {
             frame.start(*tile, t);
             tile->fill({0.5f, 0.25f, 0.125f, 1.0f});

@@ -123,7 +123,7 @@ struct PartialFrames {
                 // Inputs that are announced and never come.
                 params.timeout = std::chrono::milliseconds(soon);
                 auto open = fb.begin(params);
-                const auto tile = std::make_unique<typename FrameBuffer::Tile>();
+                const auto tile = std::make_unique<FrameBuffer::Tile>();
                 if (fb.tileOwner(lost) == fb.rank()) {
                     open.start(*tile, lost);
                     tile->source = 1000;
