@@ -123,10 +123,8 @@ public:
 
     // Sets pixels [x, x + count) of row y, in place of setRow(), in an image without dithering and without auxiliary
     // channels. `depth` may be null if the image has none. Every pixel must be set once. Returns what setRow() does.
-    double setPixels(int x, int y, int count, const double* rgba, const float* depth);
-    // Sets the colour of pixels [x, x + count) of row y from floats, which a float image gets as they are; -0 becomes
-    // 0.
-    void setPixels(int x, int y, int count, const float* rgba);
+    template <class Real>
+    double setPixels(int x, int y, int count, const Real* rgba, const float* depth = nullptr);
     // Sets pixels [x, x + count) of row y to colours that are given as they are stored, bytesPerPixel(format()) bytes
     // each, and to these depths, which may be null if the image has none.
     void setStored(int x, int y, int count, const std::byte* stored, const float* depth)
@@ -382,16 +380,11 @@ double FinishedTile::setRow(int y, const Real* rgba, const float* depth, const A
     return farthest;
 }
 
-DFB_COMPILED_ONCE double FinishedTile::setPixels(int x, int y, int count, const double* rgba, const float* depth)
+template <class Real>
+double FinishedTile::setPixels(int x, int y, int count, const Real* rgba, const float* depth)
 {
     std::byte* color = overwrite(x, y, count, depth);
     return color ? convert(rgba, count, color) : 0;
-}
-
-DFB_COMPILED_ONCE void FinishedTile::setPixels(int x, int y, int count, const float* rgba)
-{
-    if (std::byte* color = overwrite(x, y, count))
-        convert(rgba, count, color);
 }
 
 DFB_NAMESPACE_END
@@ -400,4 +393,6 @@ DFB_NAMESPACE_END
 DFB_NAMESPACE_BEGIN
 DFB_COMPILED_TEMPLATE(double FinishedTile::setRow(int, const float*, const float*, const AuxRow&));
 DFB_COMPILED_TEMPLATE(double FinishedTile::setRow(int, const double*, const float*, const AuxRow&));
+DFB_COMPILED_TEMPLATE(double FinishedTile::setPixels(int, int, int, const float*, const float*));
+DFB_COMPILED_TEMPLATE(double FinishedTile::setPixels(int, int, int, const double*, const float*));
 DFB_NAMESPACE_END
