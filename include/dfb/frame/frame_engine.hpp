@@ -395,13 +395,8 @@ private:
             const Clock::time_point begin = engine.beginTime_,
                                     rendered = begin + std::chrono::nanoseconds(engine.renderNs_),
                                     end = time == Clock::time_point() ? Clock::now() : time;
-            TraceEvent event;
-            event.frame = engine.open_.number();
             const auto add = [&](TraceEvent::Kind kind, Clock::time_point from, Clock::time_point to) {
-                event.kind = kind;
-                event.begin = from;
-                event.end = to;
-                engine.config_.trace->add(event);
+                engine.config_.trace->add({kind, 0, from, to, engine.open_.number()});
             };
             add(TraceEvent::Kind::Frame, begin, end);
             add(TraceEvent::Kind::Render, begin, rendered);
