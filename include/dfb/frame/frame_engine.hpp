@@ -538,7 +538,12 @@ private:
                 failMalformed("word of hidden inputs that there is not", 2, static_cast<std::int64_t>(body.word));
             takeWord(body);
         } else if (kind == MessageKind::Manifest) {
-            receiveManifest(source, message);
+            if (!params_.declared)
+                throw Error(errorInfo(ErrorKind::Disagreement,
+                                      "the sender declares its inputs, this rank expects no declaration"));
+            declarations_.receive(source, ByteReader(message.data() + sizeof header, message.size() - sizeof header),
+                                  [this](int tile) { return pipeline_->table().isMine(tile); });
+            mailbox_->send(source, MessageKind::ManifestAck, open_.number());
         } else if (kind == MessageKind::ManifestAck) {
             if (declarations_.acknowledged(source))
                 enterAllDeclared();
@@ -551,17 +556,6 @@ private:
     {
         hidden_.take(word);
         mailbox_->notify(); // wakes waitForWord()
-    }
-
-    void receiveManifest(int source, const Buffer& message)
-    {
-        if (!params_.declared)
-            throw Error(
-                errorInfo(ErrorKind::Disagreement, "the sender declares its inputs, this rank expects no declaration"));
-        constexpr std::size_t before = sizeof(MessageHeader);
-        declarations_.receive(source, ByteReader(message.data() + before, message.size() - before),
-                              [this](int tile) { return pipeline_->table().isMine(tile); });
-        mailbox_->send(source, MessageKind::ManifestAck, open_.number());
     }
 
     // ---- tiles

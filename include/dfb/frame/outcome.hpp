@@ -91,8 +91,13 @@ public:
     {
         reason = placed(std::move(reason));
         const OpenFrame::Failure failure = frame_.fail(reason);
-        if (failure.isFirst)
-            tellOthers(reason);
+        if (failure.isFirst) {
+            Bytes body;
+            put(body, reason);
+            for (int other = 0; other < mailbox_.size(); ++other)
+                if (other != mailbox_.rank())
+                    mailbox_.send(other, MessageKind::Abort, frame_.number(), body);
+        }
         if (!failure.inTime)
             frame_.countLate(); // too late to matter to this frame
         dropRest(reason.kind);
@@ -244,15 +249,6 @@ private:
         return terms_.allowPartial && !isMissing(kind) && kind != ErrorKind::Cancelled
                && kind != ErrorKind::Disagreement
                && (kind != ErrorKind::MalformedMessage || hasTimeout()); // it is waited for until the time-out
-    }
-
-    void tellOthers(const ErrorInfo& info)
-    {
-        Bytes body;
-        put(body, info);
-        for (int other = 0; other < mailbox_.size(); ++other)
-            if (other != mailbox_.rank())
-                mailbox_.send(other, MessageKind::Abort, frame_.number(), body);
     }
 
     void receiveAbort(const MessageHeader& header, const Buffer& message)
