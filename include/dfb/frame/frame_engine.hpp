@@ -498,7 +498,7 @@ private:
     {
         ErrorInfo where;
         where.tile = tile;
-        outcome_->fail(reason, where);
+        outcome_->fail(errorInfoOf(reason, where));
     }
 
     void failForDamage()

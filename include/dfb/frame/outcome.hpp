@@ -65,17 +65,13 @@ public:
             body();
             return true;
         } catch (...) {
-            fail(std::current_exception(), where);
+            fail(errorInfoOf(std::current_exception(), where));
             return false;
         }
     }
 
     // Reports that something went wrong on this rank. The frame fails, or goes on without the lost part if it may be
     // partial. Returns false if this rank has voted already, so that its vote does not contain the error.
-    bool fail(const std::exception_ptr& reason, const ErrorInfo& where = {})
-    {
-        return fail(errorInfoOf(reason, where));
-    }
     bool fail(ErrorInfo reason)
     {
         if (!isBearable(reason.kind))
