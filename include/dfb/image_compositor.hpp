@@ -13,9 +13,7 @@
 #include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/engine.hpp>
-#include <dfb/ops/sort_last.hpp>
 #include <dfb/render/link_owners.hpp>
-#include <dfb/render/visibility.hpp>
 
 #if defined(DFB_HAS_MPI)
 #include <dfb/comm/mpi_transport.hpp>
@@ -203,6 +201,8 @@ DFB_NAMESPACE_END
 
 #if DFB_HAS_BODIES
 #include <dfb/frame/frame_engine.hpp>
+#include <dfb/ops/sort_last.hpp>
+#include <dfb/render/visibility.hpp>
 
 DFB_NAMESPACE_BEGIN
 
