@@ -513,8 +513,10 @@ private:
         const MessageKind kind = header.kind;
         if (mailbox_->receiveCredit(source, header, message))
             return outcome_->tryVote(); // the vote may have waited for this credit
-        if (outcome_->receive(source, header, message))
-            return;
+        if (kind == MessageKind::Abort)
+            return outcome_->receiveAbort(header, message);
+        if (kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown)
+            return outcome_->receiveReduction(source, header, message);
         FinalGather& gather = pipeline_->gather();
         if (kind == MessageKind::ImagePlace) {
             gather.receivePlaces(source, bodyOf<ImagePlaces>(message), [&](std::int32_t place, std::size_t byteCount) {

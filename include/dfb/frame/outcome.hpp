@@ -119,15 +119,54 @@ public:
 
     // ---- messages
 
-    // Takes a message about the outcome of the frame: an abort or a part of a reduction. Returns false for any other
-    // message.
-    bool receive(int source, const MessageHeader& header, const Buffer& message)
+    void receiveAbort(const MessageHeader& header, const Buffer& message)
     {
-        switch (header.kind) {
-        case MessageKind::Abort: receiveAbort(header, message); return true;
-        case MessageKind::ReduceUp:
-        case MessageKind::ReduceDown: receiveReduction(source, header, message); return true;
-        default: return false;
+        ByteReader body(message.data() + sizeof header, message.size() - sizeof header);
+        ErrorInfo info = getErrorInfo(body);
+        body.end();
+        std::optional<ErrorInfo> mine;
+        if (isMissing(info.kind)) {
+            if (!failed())
+                mine = missing(info.kind);  // this rank's part of the text
+            info.tile = info.expected = -1; // weighs less than the list in its sender's own vote
+        }
+        frame_.fail(mine && Verdict::weight(*mine) > Verdict::weight(info) ? *mine : info);
+        dropRest(info.kind);
+        tryVote();
+    }
+
+    // Ranks that were given different parameters may wait for different things, so that none of them would ever be
+    // done. A partial result from below in the tree shows the difference, because it was sent without waiting for this
+    // rank.
+    void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
+    {
+        const std::uint32_t scope = mailbox_.scopeOf(message);
+        const bool isUp = header.kind == MessageKind::ReduceUp;
+        bool differs = false;
+        try {
+            if (scope == FrameVerdict) {
+                const Verdict verdict = Verdict::from(mailbox_.bytesOf(message));
+                const int tileCount = tiles_.table().layout().tileCount();
+                if (!verdict.fits(tileCount))
+                    failMalformed("a verdict on tiles that there are not", tileCount - 1);
+                differs = isUp && !verdict.terms.difference(terms_).empty();
+            } else if (scope == AllDeclared) {
+                if (!mailbox_.bytesOf(message).empty())
+                    failMalformed("a declaration's reduction that carries something");
+                differs = isUp && !terms_.declared;
+            } else if (scope == Quiet) {
+                differs = !Round::from(mailbox_.bytesOf(message)).terms.difference(terms_).empty();
+            } else {
+                failMalformed("a reduction of a kind that there is not", FrameVerdict, scope);
+            }
+            if (differs)
+                fail(Verdict::disagreement());
+            mailbox_.receiveReduction(source, header, message);
+        } catch (const Error& e) {
+            // Without this message the reduction would never have a result.
+            mailbox_.giveUp(source, e.info());
+        } catch (const std::bad_alloc& e) {
+            mailbox_.giveUp(source, errorInfo(ErrorKind::Transport, e.what()));
         }
     }
 
@@ -245,57 +284,6 @@ private:
         return terms_.allowPartial && !isMissing(kind) && kind != ErrorKind::Cancelled
                && kind != ErrorKind::Disagreement
                && (kind != ErrorKind::MalformedMessage || hasTimeout()); // it is waited for until the time-out
-    }
-
-    void receiveAbort(const MessageHeader& header, const Buffer& message)
-    {
-        ByteReader body(message.data() + sizeof header, message.size() - sizeof header);
-        ErrorInfo info = getErrorInfo(body);
-        body.end();
-        std::optional<ErrorInfo> mine;
-        if (isMissing(info.kind)) {
-            if (!failed())
-                mine = missing(info.kind);  // this rank's part of the text
-            info.tile = info.expected = -1; // weighs less than the list in its sender's own vote
-        }
-        frame_.fail(mine && Verdict::weight(*mine) > Verdict::weight(info) ? *mine : info);
-        dropRest(info.kind);
-        tryVote();
-    }
-
-    // Ranks that were given different parameters may wait for different things, so that none of them would ever be
-    // done. A partial result from below in the tree shows the difference, because it was sent without waiting for this
-    // rank.
-    void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
-    {
-        const std::uint32_t scope = mailbox_.scopeOf(message);
-        const bool isUp = header.kind == MessageKind::ReduceUp;
-        bool differs = false;
-        try {
-            if (scope == FrameVerdict) {
-                const Verdict verdict = Verdict::from(mailbox_.bytesOf(message));
-                const int tileCount = tiles_.table().layout().tileCount();
-                if (!verdict.fits(tileCount))
-                    failMalformed("a verdict on tiles that there are not", tileCount - 1);
-                differs = isUp && !verdict.terms.difference(terms_).empty();
-            } else if (scope == AllDeclared) {
-                if (!mailbox_.bytesOf(message).empty())
-                    failMalformed("a declaration's reduction that carries something");
-                differs = isUp && !terms_.declared;
-            } else if (scope == Quiet) {
-                differs = !Round::from(mailbox_.bytesOf(message)).terms.difference(terms_).empty();
-            } else {
-                failMalformed("a reduction of a kind that there is not", FrameVerdict, scope);
-            }
-            if (differs)
-                fail(Verdict::disagreement());
-            mailbox_.receiveReduction(source, header, message);
-        } catch (const Error& e) {
-            // Without this message the reduction would never have a result.
-            mailbox_.giveUp(source, e.info());
-        } catch (const std::bad_alloc& e) {
-            mailbox_.giveUp(source, errorInfo(ErrorKind::Transport, e.what()));
-        }
     }
 
     // Whether this rank has nothing left to do and only waits for other ranks.
