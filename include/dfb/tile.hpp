@@ -66,49 +66,47 @@ private:
 
 namespace detail {
 
-// The arrays of a tile, each there if the tile has the channel.
+// The array of a channel beside colour; nothing if the tile does not have the channel.
+template <Channel Which, bool isThere, int PixelCount>
+struct Plane {
+};
 template <int PixelCount>
-struct DepthPlane {
+struct Plane<Depth, true, PixelCount> {
     float depth[PixelCount];
 };
 template <int PixelCount>
-struct NormalPlane {
+struct Plane<Normal, true, PixelCount> {
     float normal[3 * PixelCount];
 };
 template <int PixelCount>
-struct AlbedoPlane {
+struct Plane<Albedo, true, PixelCount> {
     float albedo[3 * PixelCount];
 };
 template <int PixelCount>
-struct PositionPlane {
+struct Plane<Position, true, PixelCount> {
     float position[3 * PixelCount];
 };
 template <int PixelCount>
-struct PrimitiveIdPlane {
+struct Plane<PrimitiveId, true, PixelCount> {
     std::uint32_t primitiveId[PixelCount];
 };
 template <int PixelCount>
-struct InstanceIdPlane {
+struct Plane<InstanceId, true, PixelCount> {
     std::uint32_t instanceId[PixelCount];
 };
 template <int PixelCount>
-struct FarPlane {
+struct Plane<Far, true, PixelCount> {
     float farDepth[PixelCount];
 };
-template <Channel Which>
-struct NoPlane {
-};
-template <ChannelMask Channels, Channel Which, class Plane>
-using PlaneIf = std::conditional_t<hasChannel(Channels, Which), Plane, NoPlane<Which>>;
 
 template <ChannelMask Channels, int PixelCount>
-struct TilePlanes : PlaneIf<Channels, Depth, DepthPlane<PixelCount>>,
-                    PlaneIf<Channels, Normal, NormalPlane<PixelCount>>,
-                    PlaneIf<Channels, Albedo, AlbedoPlane<PixelCount>>,
-                    PlaneIf<Channels, Position, PositionPlane<PixelCount>>,
-                    PlaneIf<Channels, PrimitiveId, PrimitiveIdPlane<PixelCount>>,
-                    PlaneIf<Channels, InstanceId, InstanceIdPlane<PixelCount>>,
-                    PlaneIf<Channels, Far, FarPlane<PixelCount>> {
+struct TilePlanes : Plane<Depth, hasChannel(Channels, Depth), PixelCount>,
+                    Plane<Normal, hasChannel(Channels, Normal), PixelCount>,
+                    Plane<Albedo, hasChannel(Channels, Albedo), PixelCount>,
+                    Plane<Position, hasChannel(Channels, Position), PixelCount>,
+                    Plane<PrimitiveId, hasChannel(Channels, PrimitiveId), PixelCount>,
+                    Plane<InstanceId, hasChannel(Channels, InstanceId), PixelCount>,
+                    Plane<Far, hasChannel(Channels, Far), PixelCount> {
     float color[4 * PixelCount];
 
     // Calls f(channel, array) for each array that there is.
