@@ -149,7 +149,9 @@ public:
                 const int tileCount = tiles_.table().layout().tileCount();
                 if (!verdict.fits(tileCount))
                     failMalformed("a verdict on tiles that there are not", tileCount - 1);
-                differs = isUp && !verdict.terms.difference(terms_).empty();
+                // A rank that votes with an error has told all others why, unless they may go on without its part.
+                const bool isCause = verdict.error && !terms_.allowPartial;
+                differs = isUp && !isCause && !verdict.terms.difference(terms_).empty();
             } else if (scope == AllDeclared) {
                 if (!mailbox_.bytesOf(message).empty())
                     failMalformed("a declaration's reduction that carries something");

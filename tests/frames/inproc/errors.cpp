@@ -5,6 +5,7 @@
 #include "forward.hpp"
 #include "random_scene.hpp"
 
+#include <dfb/testing/fault_transport.hpp>
 #include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
@@ -1647,6 +1648,34 @@ TEST_CASE("A camera that throws on one rank is why a frame fails, also if it may
     CHECK(allSame(texts));
     CHECK(has(texts[0], "rank 1: "));
     CHECK(has(texts[0], "no such eye"));
+}
+
+TEST_CASE("A camera that throws on one rank is why a frame fails, also if its vote overtakes the news", "[errors]")
+{
+    using Transport = dfb::testing::FaultTransport<dfb::InprocTransport>;
+    dfb::testing::FaultOptions faults;
+    faults.delay = 1;
+    faults.maxDelay = std::chrono::milliseconds(4);
+    faults.only = [](int, const dfb::Buffer& message) {
+        return dfb::detail::loadAs<dfb::detail::MessageHeader>(message.data()).kind == dfb::detail::MessageKind::Abort;
+    };
+    std::vector<std::string> texts;
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, Transport> fb({communicator, faults}, {128, 64});
+        const auto z = static_cast<float>(fb.rank());
+        const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, z}, {1, 1, z}}}});
+        const dfb::SharedWorld all(fb, world);
+        dfb::DataParallelLoop loop(fb, world, all);
+        for (int frame = 0; frame < 20; ++frame) {
+            std::string text =
+                outcomeOf([&] { loop.render(ThrowingEye(fb.rank() == 1), [](const dfb::Brick&, auto&) {}); });
+            if (fb.rank() == 0)
+                texts.push_back(std::move(text));
+        }
+    });
+    REQUIRE(texts.size() == 20);
+    for (const std::string& text : texts)
+        CHECK(has(text, "no such eye"));
 }
 
 TEST_CASE("Of a partial frame only the tile is lost whose operation cannot be made", "[errors]")
