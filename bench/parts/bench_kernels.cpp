@@ -336,10 +336,10 @@ void measureInPlace(int count, const char* instructions, decltype(&dfb::detail::
                 const std::size_t x = next % (width / side) * side, y = next / (width / side) * side;
                 for (std::size_t row = y; row < y + side; ++row) {
                     for (std::size_t k = 0; k < rows.size(); ++k) {
-                        const float* const pixels = (*images)[k].data() + 4 * x;
+                        const auto* const pixels = reinterpret_cast<const std::byte*>((*images)[k].data() + 4 * x);
                         rows[k].span = {0, side};
-                        rows[k].color = pixels + 4 * width * row;
-                        rows[k].colorAhead = pixels + 4 * width * std::min(row + 1, y + side - 1);
+                        rows[k].first.color = pixels + 16 * width * row;
+                        rows[k].ahead.color = pixels + 16 * width * std::min(row + 1, y + side - 1);
                     }
                     benchmark::DoNotOptimize(blend(rows.data(), count, 0, rgba.data(), transmittance.data()));
                     benchmark::ClobberMemory();

@@ -182,16 +182,16 @@ public:
             result.depthLimit = std::numeric_limits<float>::infinity();
             return findRow(row, result);
         }
-        const detail::PixelsInPlace& pixels = parts_->inPlace;
-        detail::RowPlace first, ahead;
-        if (!findPlaces(row, result.valid, first, ahead))
+        detail::RowInPlace its;
+        if (!findPlaces(row, its))
             return false;
-        ahead.prefetchAll(result.valid.count, 4);
+        its.ahead.prefetchAll(its.span.count, 4);
+        result.valid = its.span;
         result.spans = &result.valid;
         result.spanCount = 1;
-        result.bytes = first.color;
-        result.depth = first.depth;
-        result.depthLimit = pixels.activity.depthLimit;
+        result.bytes = its.first.color;
+        result.depth = its.first.depth;
+        result.depthLimit = parts_->inPlace.activity.depthLimit;
         return true;
     }
     // Adds `count` NaN depths that the caller of nextBytes() has found to the frame's counts.
@@ -206,14 +206,7 @@ public:
     // the row has no pixels, is not in place, or must be converted.
     bool findInPlace(detail::RowInPlace& row) const
     {
-        detail::RowPlace first, ahead;
-        if (!isInPlace() || !parts_->inPlace.activity.byColorAlone() || !findPlaces(row_, row.span, first, ahead))
-            return false;
-        row.color = detail::floatsOf(first.color);
-        row.depth = first.depth;
-        row.colorAhead = detail::floatsOf(ahead.color);
-        row.depthAhead = ahead.depth;
-        return true;
+        return isInPlace() && parts_->inPlace.activity.byColorAlone() && findPlaces(row_, row);
     }
 
     void advance(const FragmentRow& row)
@@ -254,17 +247,16 @@ private:
         return pixels;
     }
 
-    // For pixels in place: sets `span` to the pixels that row `row` has, `first` to the place of the first of them, and
-    // `ahead` to that of the first pixel of the row to prefetch meanwhile. False if the row has no pixels.
-    bool findPlaces(int row, Span& span, detail::RowPlace& first, detail::RowPlace& ahead) const
+    // For pixels in place: sets `result` to row `row`. False if the row has no pixels.
+    bool findPlaces(int row, detail::RowInPlace& result) const
     {
         const detail::PixelsInPlace& pixels = parts_->inPlace;
         const Region& valid = pixels.valid;
         if (row < valid.y0 || row >= valid.y1)
             return false;
-        span = {static_cast<std::uint16_t>(valid.x0), static_cast<std::uint16_t>(valid.width())};
-        first = pixels.at(valid.x0, row);
-        ahead = pixels.at(valid.x0, detail::rowAhead(row, valid.y1, valid.width()));
+        result.span = {static_cast<std::uint16_t>(valid.x0), static_cast<std::uint16_t>(valid.width())};
+        result.first = pixels.at(valid.x0, row);
+        result.ahead = pixels.at(valid.x0, detail::rowAhead(row, valid.y1, valid.width()));
         return true;
     }
 

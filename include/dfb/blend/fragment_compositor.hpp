@@ -222,7 +222,7 @@ private:
             const Span &span = rows_[k].span, &first = rows_.front().span;
             if (span.x != first.x || span.count != first.count || span.count < 4)
                 return false;
-            layers_[k] = {rows_[k].color, rows_[k].depth, nullptr};
+            layers_[k] = {detail::floatsOf(rows_[k].first.color), rows_[k].first.depth, nullptr};
         }
         return true;
     }

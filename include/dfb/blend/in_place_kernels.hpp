@@ -23,8 +23,9 @@ inline constexpr int rowsAtOnce = 4;   // rows of them that are read at once: me
 // Reads four pixels of a row in place, each value once, and adds them to `check`. Returns false if all are 0.
 DFB_AVX2 DFB_INLINE bool read(const RowInPlace& row, std::ptrdiff_t pixel, Avx2Colors& colors, Avx2ColorCheck& check)
 {
-    prefetch(reinterpret_cast<const std::byte*>(row.colorAhead + 4 * pixel), 64);
-    const __m256 ab = _mm256_loadu_ps(row.color + 4 * pixel), cd = _mm256_loadu_ps(row.color + 4 * pixel + 8);
+    prefetch(reinterpret_cast<const std::byte*>(floatsOf(row.ahead.color) + 4 * pixel), 64);
+    const float* const color = floatsOf(row.first.color);
+    const __m256 ab = _mm256_loadu_ps(color + 4 * pixel), cd = _mm256_loadu_ps(color + 4 * pixel + 8);
     check.add(ab), check.add(cd);
     colors.a = _mm256_castps256_ps128(ab), colors.b = _mm256_extractf128_ps(ab, 1);
     colors.c = _mm256_castps256_ps128(cd), colors.d = _mm256_extractf128_ps(cd, 1);
@@ -258,8 +259,8 @@ DFB_AVX2 std::uint64_t sortSparseRowsAvx2(const RowInPlace* rows, int layers, in
                     Avx2Colors colors;
                     if (!read(rows[k], i, colors, check))
                         continue;
-                    prefetch(reinterpret_cast<const std::byte*>(rows[k].depthAhead + i), 64);
-                    const __m128 depth = _mm_loadu_ps(rows[k].depth + i);
+                    prefetch(reinterpret_cast<const std::byte*>(rows[k].ahead.depth + i), 64);
+                    const __m128 depth = _mm_loadu_ps(rows[k].first.depth + i);
                     nan = _mm_or_ps(nan, _mm_cmpunord_ps(depth, depth));
                     fours[four].add(colors, depth);
                 }

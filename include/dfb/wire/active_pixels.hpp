@@ -52,13 +52,11 @@ struct RowPlace {
     }
 };
 
-// A row of pixels in place, active where they have a colour. The renderer may still change them.
+// A row of pixels in place. The renderer may still change them.
 struct RowInPlace {
     Span span;
-    const float* color = nullptr;
-    const float* depth = nullptr; // null: not wanted
-    // Colour and depth of a later row, to be prefetched meanwhile.
-    const float *colorAhead = nullptr, *depthAhead = nullptr;
+    RowPlace first; // of its pixels
+    RowPlace ahead; // the first pixel of a later row, to be prefetched meanwhile
 };
 
 // The rule by which pixels are active.

@@ -138,7 +138,7 @@ TEST_CASE("Full rows in place: with AVX2 and AVX-512 as in plain C++", "[kernels
         for (const dfb::Layer& layer : stack.layers) {
             d::RowInPlace& row = rows.emplace_back();
             row.span = {0, static_cast<std::uint16_t>(width)};
-            row.color = row.colorAhead = layer.color;
+            row.first.color = row.ahead.color = reinterpret_cast<const std::byte*>(layer.color);
             for (int i = 0; i < width; ++i) {
                 const float* pixel = layer.color + 4 * i;
                 isGood = isGood && std::all_of(pixel, pixel + 4, [](float c) { return std::isfinite(c); })
