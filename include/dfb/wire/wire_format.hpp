@@ -148,18 +148,14 @@ inline double wireErrorBound(WireFormat format, std::int64_t layers, double maxC
 // `layers` is 0, it is not known, and 65536 is assumed.
 inline WireFormat cheapestWithin(double budget, std::int64_t layers, double maxColor, double background)
 {
-    const std::int64_t most = layers > 0 ? layers : 65536;
-    WireFormat best = WireFormat::Float32;
-    double bound = 0;
-    for (const WireFormat format : {WireFormat::Unorm16, WireFormat::Float16, WireFormat::Unorm8}) {
-        const double its = wireErrorBound(format, most, maxColor, background);
-        const std::size_t bytes = detail::bytesOf(format), bestBytes = detail::bytesOf(best);
-        if (its <= budget && (bytes < bestBytes || (bytes == bestBytes && its < bound))) {
-            best = format;
-            bound = its;
-        }
-    }
-    return best;
+    const auto boundOf = [&](WireFormat format) {
+        return wireErrorBound(format, layers > 0 ? layers : 65536, maxColor, background);
+    };
+    if (boundOf(WireFormat::Unorm8) <= budget)
+        return WireFormat::Unorm8;
+    const bool isHalfBetter = boundOf(WireFormat::Float16) < boundOf(WireFormat::Unorm16);
+    const WireFormat best = isHalfBetter ? WireFormat::Float16 : WireFormat::Unorm16;
+    return boundOf(best) <= budget ? best : WireFormat::Float32;
 }
 
 inline const char* nameOf(WireFormat format) noexcept
