@@ -8,7 +8,6 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <cstring>
 
 DFB_NAMESPACE_BEGIN
 
@@ -108,12 +107,12 @@ public:
     // Whether pixels may travel in a format other than Float32.
     bool inRange(const float* rgba, int count) const noexcept;
 
-    // Encodes `count` pixels, which are in range unless the format is Float32. `out` gets 4 * bytesOf(format) bytes for
+    // Encodes `count` pixels, which are in range, in a format that rounds. `out` gets 4 * bytesOf(format) bytes for
     // each.
     void encodeColor(WireFormat format, const float* rgba, int count, std::byte* out) const;
-    // Decodes `count` pixels. An alpha that was rounded to 0 becomes leastAlpha. It is known to have been above 0: a
-    // pixel of alpha 0 that is in range has no colour, and does not travel. With activeByDepth it does travel, and an
-    // alpha of 0 stays 0. Returns false if there is a code that encodeColor() does not make.
+    // Decodes `count` pixels, which are not Float32. An alpha that was rounded to 0 becomes leastAlpha. It is known to
+    // have been above 0: a pixel of alpha 0 that is in range has no colour, and does not travel. With activeByDepth it
+    // does travel, and an alpha of 0 stays 0. Returns false if there is a code that encodeColor() does not make.
     bool decodeColor(WireFormat format, const std::byte* in, std::size_t count, float* rgba) const;
 
     // Above 0, less than the least alpha that has a code of its own, and negligible beside the error bound.
@@ -196,10 +195,10 @@ DFB_COMPILED_ONCE void WireCoder::encodeColor(WireFormat format, const float* rg
         DFB_FASTEST(encodePixels<Code>, encodePixelsAvx2<Code>, rgba, count, by, out);
     };
     switch (format) {
-    case WireFormat::Float32: std::memcpy(out, rgba, 4 * sizeof(float) * static_cast<std::size_t>(count)); return;
     case WireFormat::Float16: encode(HalfCode(), scale_, 0x1p15f); return;
     case WireFormat::Unorm16: encode(Unorm16Code(), 65535.0f / maxColor_, 65535.0f); return;
     case WireFormat::Unorm8: encode(Unorm8Code(), 255.0f / maxColor_, 255.0f); return;
+    case WireFormat::Float32:
     case WireFormat::Bytes: return; // the caller has copied them
     }
 }
@@ -214,11 +213,11 @@ DFB_COMPILED_ONCE bool WireCoder::decodeColor(WireFormat format, const std::byte
         return DFB_FASTEST(decodePixels<Code>, decodePixelsAvx2<Code>, in, pixels, by, rgba);
     };
     switch (format) {
-    case WireFormat::Float32: std::memcpy(rgba, in, 4 * sizeof(float) * count); break;
     case WireFormat::Float16: return decode(HalfCode(), 1 / scale_, 0x1p-15f);
     case WireFormat::Unorm16: return decode(Unorm16Code(), maxColor_ / 65535.0f, 1 / 65535.0f);
     case WireFormat::Unorm8: return decode(Unorm8Code(), maxColor_ / 255.0f, 1 / 255.0f);
     case WireFormat::Bytes: bytesToFloats(in, count, rgba); break;
+    case WireFormat::Float32: break; // the caller reads them in place
     }
     return true;
 }
