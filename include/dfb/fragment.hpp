@@ -132,7 +132,6 @@ public:
     explicit FragmentCursor(const Fragment& fragment, detail::RowPixels* row = nullptr, bool countsFaults = false)
         : parts_(&fragment.parts_), span_(fragment.parts_.spans), color_(fragment.parts_.color),
           bytes_(fragment.parts_.bytes), depth_(fragment.parts_.depth), aux_(fragment.parts_.aux),
-          hasAux_((fragment.parts_.channels & ~(colorChannel | depthChannel)) != 0),
           faults_(countsFaults ? fragment.parts_.faults : nullptr), rowPixels_(row)
     {
         if (!row && fragment.isMadeByRow()) {
@@ -222,7 +221,7 @@ public:
             color_ += 4 * pixels;
         if (depth_)
             depth_ += pixels;
-        if (hasAux_)
+        if ((parts_->channels & ~(colorChannel | depthChannel)) != 0)
             aux_.advance(pixels);
     }
 
@@ -286,7 +285,6 @@ private:
     const std::byte* bytes_;
     const float* depth_;
     detail::ConstPlanes aux_;
-    bool hasAux_;
     detail::FaultCounts* faults_; // null: they are not counted
     int row_ = 0;
     detail::RowPixels* rowPixels_; // of the row that next() returned
