@@ -161,13 +161,12 @@ public:
     // Hands over the memory of the planes. The image is empty afterwards.
     std::array<Buffer, detail::channelCount> release() noexcept { return std::move(planes_); }
 
-    // The address of pixel `first` in each plane; null where there is no plane.
-    detail::Planes planesAt(std::size_t first) noexcept
+    // The address of each plane; null where there is none.
+    detail::Planes planes() noexcept
     {
         detail::Planes planes;
         for (std::size_t c = 0; c < detail::channelCount; ++c)
-            if (!planes_[c].empty())
-                planes.at[c] = planes_[c].data() + first * pixelBytes(c);
+            planes.at[c] = planes_[c].data();
         return planes;
     }
 

@@ -123,7 +123,7 @@ public:
         if (image_.empty())
             return std::nullopt;
         gateMemory_ = pool_->acquire(std::max(sizeof(ImageGate), MemoryPool::smallestShared));
-        const Planes planes = image_.planesAt(0);
+        const Planes planes = image_.planes();
         ImagePlaces places;
         places.gate = placeOf(gateMemory_.data());
         bool all = places.gate >= 0;
@@ -178,7 +178,7 @@ public:
             return;
         // A writer is still inside, or has died there. The memory is left to it, and the image continues in a copy.
         Image copy(*pool_, layout_.width(), layout_.height(), config_.image.format, channels_);
-        const Planes from = image_.planesAt(0), to = copy.planesAt(0);
+        const Planes from = image_.planes(), to = copy.planes();
         for (std::size_t c = 0; c < channelCount; ++c)
             if (to.at[c])
                 std::memcpy(to.at[c], from.at[c], copy.pixelCount() * record_.pixelBytes(c));
@@ -204,7 +204,7 @@ public:
             return place;
         const Region region = layout_.region(tile);
         if (isDisplay())
-            return inImage(image_.planesAt(0), region);
+            return inImage(image_.planes(), region);
         if (SharedImage image = remote(); image.gate)
             if (auto writer = image.gate->enter(frame_)) {
                 place = inImage(image.planes, region);
@@ -372,7 +372,7 @@ public:
                 continue;
             }
             const Region region = layout_.region(tile);
-            const Place place = inImage(image_.planesAt(0), region);
+            const Place place = inImage(image_.planes(), region);
             FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither);
             row.resize(4 * static_cast<std::size_t>(region.width()));
             for (std::size_t i = 0; i < row.size(); ++i)
@@ -520,7 +520,7 @@ private:
             const std::size_t bytes = record_.read(in, left, layout_, [&](int its, const Region& region) {
                 tile = its;
                 take(tile, source);
-                return inImage(image_.planesAt(0), region);
+                return inImage(image_.planes(), region);
             });
             tellTile(tile);
             in += bytes;
