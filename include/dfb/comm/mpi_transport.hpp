@@ -209,21 +209,15 @@ private:
         int found = 0;
         check(MPI_Comm_get_attr(comm(), MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
         lastTag_ = found ? std::min(*tagBound, 1 << 20) : 32767;
-        oversubscription_ = oversubscription();
+        // The square of the number of ranks per core: that many ranks wake up, and each takes the core from that many.
+        const std::int64_t ranksPerCore =
+            std::int64_t{4} * sharingRanks() / Processors::ofThisThread().count(); // in quarters
+        oversubscription_ = static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
         if (ranks_.memory())
             listener_.emplace(ranks_.memory()->doorbell());
         peers_.resize(static_cast<std::size_t>(size()));
         for (int i = 0; i < postedPackets; ++i)
             receive(packets_, {pool_->acquire(detail::packetBytes), 0, MPI_ANY_SOURCE, 0});
-    }
-
-    // The factor by which naps are longer, in quarters, from 4 to 16. It is the square of the number of ranks per core:
-    // that many ranks wake up, and each takes the core from that many.
-    int oversubscription() const
-    {
-        const std::int64_t ranksPerCore =
-            std::int64_t{4} * ranks_.sharingRanks() / Processors::ofThisThread().count(); // in quarters
-        return static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
     }
 
     // Whether send() ends the nap under way. While nobody waits here (naps are long), a renderer sends tile after tile.
@@ -692,7 +686,7 @@ private:
     detail::MpiRanks ranks_;
     TransportHandler* handler_ = nullptr; // since start(), before which nothing is sent or received
     int lastTag_ = 1;
-    int oversubscription_ = 4;
+    int oversubscription_ = 4; // the factor by which naps are longer, in quarters
 
     std::optional<detail::Doorbell::Listener> listener_; // of this rank's doorbell; without, signal_ is used
     std::atomic<bool> isRungForAll_{false};              // nothing can come that is not announced by the doorbell
