@@ -46,7 +46,11 @@ public:
             failArgument("the communicator is MPI_COMM_NULL: only ranks that have one can take part");
         if (int isInter = 0; MPI_Comm_test_inter(communicator, &isInter) == MPI_SUCCESS && isInter)
             failArgument("the communicator is an intercommunicator: make one of both groups by MPI_Intercomm_merge()");
-        duplicate(communicator);
+        MPI_Request duplicated = MPI_REQUEST_NULL;
+        check(MPI_Comm_idup(communicator, &comm_, &duplicated), "MPI_Comm_idup");
+        waitMpi(duplicated, rank_);
+        check(MPI_Comm_rank(comm_, &rank_), "MPI_Comm_rank");
+        check(MPI_Comm_size(comm_, &size_), "MPI_Comm_size");
         attempt([this] {
             check(MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
             others_.resize(static_cast<std::size_t>(size_));
@@ -107,15 +111,6 @@ public:
 
 private:
     void check(int code, const char* call) const { checkMpi(code, call, rank_); }
-
-    void duplicate(MPI_Comm communicator)
-    {
-        MPI_Request duplicated = MPI_REQUEST_NULL;
-        check(MPI_Comm_idup(communicator, &comm_, &duplicated), "MPI_Comm_idup");
-        waitMpi(duplicated, rank_);
-        check(MPI_Comm_rank(comm_, &rank_), "MPI_Comm_rank");
-        check(MPI_Comm_size(comm_, &size_), "MPI_Comm_size");
-    }
 
     // Returns the values of all ranks, on all ranks.
     template <class T>
