@@ -118,7 +118,7 @@ private:
     const Clock::time_point since_ = Clock::now();
 };
 
-inline void complete(MPI_Request& request, Waiting waiting)
+inline void complete(MPI_Request& request, Waiting waiting = Waiting::Yield)
 {
     if (waiting == Waiting::Blocking) {
         MPI_Wait(&request, MPI_STATUS_IGNORE);

@@ -39,14 +39,6 @@ inline std::vector<IceTStrategy> icetStrategies()
     };
 }
 
-struct IceTSettings {
-    IceTEnum strategy = ICET_STRATEGY_SEQUENTIAL;
-    IceTEnum singleImage = ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC;
-    bool ubyte = false;               // Colours are 4 bytes, not 4 floats.
-    bool interlace = true;            // IceT's default: shuffle pixels, to balance the work.
-    Waiting waiting = Waiting::Yield; // How it waits for MPI.
-};
-
 // ---- MPI for IceT
 
 // What a rank has sent to others. A collective call counts as what the rank must send if no rank forwards data of
@@ -55,12 +47,11 @@ struct IceTTraffic {
     std::int64_t bytes = 0, messages = 0;
 };
 
-// A communicator for IceT, which waits as `waiting` says.
+// A communicator for IceT, which tests, and gives up its time slice in between, while it waits.
 class IceTMpi : public IceTCommunicatorStruct {
 public:
     // The communicator and `traffic` remain the caller's. IceT duplicates this object.
-    IceTMpi(MPI_Comm comm, Waiting waiting, IceTTraffic& traffic)
-        : IceTCommunicatorStruct{}, comm_(comm), waiting_(waiting), traffic_(&traffic)
+    IceTMpi(MPI_Comm comm, IceTTraffic& traffic) : IceTCommunicatorStruct{}, comm_(comm), traffic_(&traffic)
     {
         MPI_Comm_rank(comm_, &rank_);
         MPI_Comm_size(comm_, &size_);
@@ -116,8 +107,8 @@ private:
         MPI_Comm copy = MPI_COMM_NULL;
         MPI_Request request = MPI_REQUEST_NULL;
         MPI_Comm_idup(comm_, &copy, &request);
-        complete(request, waiting_);
-        return new IceTMpi(copy, waiting_, *traffic_);
+        complete(request);
+        return new IceTMpi(copy, *traffic_);
     }
 
     // The only call that waits inside MPI, which has no other way; IceT does not make it while it composites.
@@ -130,7 +121,7 @@ private:
         MPI_Comm_create(comm_, some, &comm);
         MPI_Group_free(&some);
         MPI_Group_free(&all);
-        return comm == MPI_COMM_NULL ? nullptr : new IceTMpi(comm, waiting_, *traffic_);
+        return comm == MPI_COMM_NULL ? nullptr : new IceTMpi(comm, *traffic_);
     }
 
     void count(std::int64_t messages, std::int64_t bytesEach)
@@ -167,18 +158,15 @@ private:
         request = ICET_COMM_REQUEST_NULL;
     }
 
-    int waitAny(int number, IceTCommRequest* requests) const
+    static int waitAny(int number, IceTCommRequest* requests)
     {
         std::vector<MPI_Request> all;
         for (int i = 0; i < number; ++i)
             all.push_back(requests[i] == ICET_COMM_REQUEST_NULL ? MPI_REQUEST_NULL : of(requests[i]));
         int index = MPI_UNDEFINED, done = 0;
-        Idler idler(waiting_);
-        if (waiting_ == Waiting::Blocking)
-            MPI_Waitany(number, all.data(), &index, MPI_STATUS_IGNORE);
-        else
-            while (MPI_Testany(number, all.data(), &index, &done, MPI_STATUS_IGNORE), !done)
-                idler.idle();
+        Idler idler(Waiting::Yield);
+        while (MPI_Testany(number, all.data(), &index, &done, MPI_STATUS_IGNORE), !done)
+            idler.idle();
         if (index == MPI_UNDEFINED)
             return -1;
         destroy(requests[index]);
@@ -189,18 +177,18 @@ private:
     {
         Send = [](IceTCommunicator self, const void* buffer, int number, IceTEnum type, int to, int tag) {
             MPI_Request request = of(self).send(buffer, number, type, to, tag);
-            complete(request, of(self).waiting_);
+            complete(request);
         };
         Recv = [](IceTCommunicator self, void* buffer, int number, IceTEnum type, int from, int tag) {
             MPI_Request request = of(self).receive(buffer, number, type, from, tag);
-            complete(request, of(self).waiting_);
+            complete(request);
         };
         Sendrecv = [](IceTCommunicator self, const void* sent, int sentNumber, IceTEnum sentType, int to, int sentTag,
                       void* received, int number, IceTEnum type, int from, int tag) {
             MPI_Request receiving = of(self).receive(received, number, type, from, tag);
             MPI_Request sending = of(self).send(sent, sentNumber, sentType, to, sentTag);
-            complete(sending, of(self).waiting_);
-            complete(receiving, of(self).waiting_);
+            complete(sending);
+            complete(receiving);
         };
         Isend = [](IceTCommunicator self, const void* buffer, int number, IceTEnum type, int to, int tag) {
             return wrap(of(self).send(buffer, number, type, to, tag));
@@ -208,15 +196,13 @@ private:
         Irecv = [](IceTCommunicator self, void* buffer, int number, IceTEnum type, int from, int tag) {
             return wrap(of(self).receive(buffer, number, type, from, tag));
         };
-        Wait = [](IceTCommunicator self, IceTCommRequest* request) {
+        Wait = [](IceTCommunicator, IceTCommRequest* request) {
             if (*request == ICET_COMM_REQUEST_NULL)
                 return;
-            complete(of(*request), of(self).waiting_);
+            complete(of(*request));
             destroy(*request);
         };
-        Waitany = [](IceTCommunicator self, int number, IceTCommRequest* requests) {
-            return of(self).waitAny(number, requests);
-        };
+        Waitany = [](IceTCommunicator, int number, IceTCommRequest* requests) { return waitAny(number, requests); };
     }
 
     void setCollectives()
@@ -227,7 +213,7 @@ private:
                 mpi.count(1, 0);
             MPI_Request request = MPI_REQUEST_NULL;
             MPI_Ibarrier(mpi.comm_, &request);
-            complete(request, mpi.waiting_);
+            complete(request);
         };
         Gather = [](IceTCommunicator self, const void* sent, int number, IceTEnum type, void* received, int root) {
             IceTMpi& mpi = of(self);
@@ -235,7 +221,7 @@ private:
             MPI_Request request = MPI_REQUEST_NULL;
             MPI_Igather(inPlaceOr(sent), number, typeOf(type).mpi, received, number, typeOf(type).mpi, root, mpi.comm_,
                         &request);
-            complete(request, mpi.waiting_);
+            complete(request);
         };
         Gatherv = [](IceTCommunicator self, const void* sent, int number, IceTEnum type, void* received,
                      const int* numbers, const int* places, int root) {
@@ -244,7 +230,7 @@ private:
             MPI_Request request = MPI_REQUEST_NULL;
             MPI_Igatherv(inPlaceOr(sent), number, typeOf(type).mpi, received, numbers, places, typeOf(type).mpi, root,
                          mpi.comm_, &request);
-            complete(request, mpi.waiting_);
+            complete(request);
         };
         Allgather = [](IceTCommunicator self, const void* sent, int number, IceTEnum type, void* received) {
             IceTMpi& mpi = of(self);
@@ -252,7 +238,7 @@ private:
             MPI_Request request = MPI_REQUEST_NULL;
             MPI_Iallgather(inPlaceOr(sent), number, typeOf(type).mpi, received, number, typeOf(type).mpi, mpi.comm_,
                            &request);
-            complete(request, mpi.waiting_);
+            complete(request);
         };
         Alltoall = [](IceTCommunicator self, const void* sent, int number, IceTEnum type, void* received) {
             IceTMpi& mpi = of(self);
@@ -260,13 +246,12 @@ private:
             MPI_Request request = MPI_REQUEST_NULL;
             MPI_Ialltoall(inPlaceOr(sent), number, typeOf(type).mpi, received, number, typeOf(type).mpi, mpi.comm_,
                           &request);
-            complete(request, mpi.waiting_);
+            complete(request);
         };
     }
 
     MPI_Comm comm_;
     int rank_ = 0, size_ = 1;
-    Waiting waiting_;
     IceTTraffic* traffic_;
 };
 
@@ -275,12 +260,13 @@ private:
 // One image of all ranks. IceT knows one context at a time per process: use all IceTs from one thread.
 class IceT {
 public:
-    // Collective, as is the destructor, which must come before MPI_Finalize. Throws std::runtime_error.
-    IceT(MPI_Comm comm, const IceTSettings& settings, int width, int height) : ubyte_(settings.ubyte)
+    // `ubyte`: colours are 4 bytes, not 4 floats. Collective, as is the destructor, which must come before
+    // MPI_Finalize. Throws std::runtime_error.
+    IceT(MPI_Comm comm, const IceTStrategy& strategy, bool ubyte, int width, int height) : ubyte_(ubyte)
     {
         MPI_Comm_rank(comm, &rank_);
         MPI_Comm_size(comm, &size_);
-        IceTMpi mpi(comm, settings.waiting, traffic_);
+        IceTMpi mpi(comm, traffic_);
         context_.reset(icetCreateContext(&mpi)); // makes a duplicate of `mpi`
         icetSetContext(context_.get());
         icetDiagnostics(ICET_DIAG_WARNINGS | ICET_DIAG_ALL_NODES);
@@ -288,9 +274,9 @@ public:
         icetSetDepthFormat(ICET_IMAGE_DEPTH_NONE);
         icetCompositeMode(ICET_COMPOSITE_MODE_BLEND);
         icetEnable(ICET_ORDERED_COMPOSITE);
-        (settings.interlace ? icetEnable : icetDisable)(ICET_INTERLACE_IMAGES);
-        icetStrategy(settings.strategy);
-        icetSingleImageStrategy(settings.singleImage);
+        icetEnable(ICET_INTERLACE_IMAGES); // IceT's default: pixels are shuffled, to balance the work
+        icetStrategy(strategy.strategy);
+        icetSingleImageStrategy(strategy.singleImage);
         icetResetTiles();
         icetAddTile(0, 0, width, height, 0);
         check();
@@ -301,7 +287,7 @@ public:
 
     // Collective: blends the images of all ranks with "over". `order` has the ranks from front to back, the same on
     // all. `colour` is this rank's whole image, premultiplied RGBA in rows without gaps, floats or bytes (at an address
-    // divisible by 4) as the settings say; `viewport` (x, y, width, height) the part outside of which it is ignored,
+    // divisible by 4) as said at first; `viewport` (x, y, width, height) the part outside of which it is ignored,
     // which may be empty. Where alpha is 0 IceT takes a pixel for empty, whatever its colour. On rank 0 returns the
     // image, likewise, which is IceT's until the next call; elsewhere null. Throws std::runtime_error.
     const void* composite(const void* colour, const int viewport[4], const std::vector<int>& order)

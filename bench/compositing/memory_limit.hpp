@@ -52,7 +52,7 @@ public:
             std::memset(out_.data(), static_cast<int>(seen_ & 0xff), out_.size());
         MPI_Request request = MPI_REQUEST_NULL;
         MPI_Ibarrier(comm_, &request);
-        complete(request, Waiting::Yield);
+        complete(request);
     }
 
 private:

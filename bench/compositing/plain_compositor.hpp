@@ -122,7 +122,7 @@ protected:
     static void waitAll(std::vector<MPI_Request>& requests)
     {
         for (MPI_Request& request : requests)
-            complete(request, Waiting::Yield);
+            complete(request);
     }
 
 private:

@@ -413,10 +413,6 @@ inline void addIceT(std::vector<System>& systems, const Inputs& inputs)
             continue;
         for (const Way way : {Way::Floats, Way::FloatsToBytes, Way::Bytes, Way::BytesOfFloats}) {
             const bool hasBytes = way == Way::Bytes || way == Way::BytesOfFloats;
-            IceTSettings settings;
-            settings.strategy = strategy.strategy;
-            settings.singleImage = strategy.singleImage;
-            settings.ubyte = hasBytes;
             System s;
             s.name = "icet";
             s.config = (way == Way::Bytes           ? "ubyte, "
@@ -425,9 +421,9 @@ inline void addIceT(std::vector<System>& systems, const Inputs& inputs)
                        + name;
             s.output = way == Way::Floats ? "float" : "8 bit";
             s.copied = way == Way::Floats ? 0 : 4;
-            s.start = [settings, way, hasBytes, convert, &inputs] {
+            s.start = [strategy, way, hasBytes, convert, &inputs] {
                 const PartialImage& first = inputs.image();
-                const auto icet = std::make_shared<IceT>(inputs.comm, settings, first.width, first.height);
+                const auto icet = std::make_shared<IceT>(inputs.comm, strategy, hasBytes, first.width, first.height);
                 const std::size_t values = first.rgba.size();
                 // Of all views if they are to be ready, else of one.
                 const auto bytes = std::make_shared<std::vector<std::vector<std::uint8_t>>>(

@@ -225,10 +225,7 @@ public:
     // Collective.
     MarchedSystem icet(const IceTStrategy& strategy)
     {
-        IceTSettings settings;
-        settings.strategy = strategy.strategy;
-        settings.singleImage = strategy.singleImage;
-        const auto icet = std::make_shared<IceT>(comm_, settings, width_, height_);
+        const auto icet = std::make_shared<IceT>(comm_, strategy, false, width_, height_);
         const auto result = std::make_shared<const float*>(nullptr);
         return {std::string("icet: ") + strategy.name,
                 [this, icet, result](const MarchedView& view) {

@@ -414,8 +414,7 @@ bool isIceTRight(const Setup& setup, const View& view)
 
 class Run {
 public:
-    Run(const Api& icet, const Api& dfb, MPI_Comm comm)
-        : icet_(icet), dfb_(dfb), comm_(comm), mpi_(comm, bench::Waiting::Yield, traffic_)
+    Run(const Api& icet, const Api& dfb, MPI_Comm comm) : icet_(icet), dfb_(dfb), comm_(comm), mpi_(comm, traffic_)
     {
         dfb_.find(createCommunicator_, "icetCreateMPICommunicator");
         dfb_.find(destroyCommunicator_, "icetDestroyMPICommunicator");
@@ -570,7 +569,7 @@ private:
         std::vector<int> all(static_cast<std::size_t>(4 * size_));
         MPI_Request request = MPI_REQUEST_NULL;
         MPI_Iallgather(mine.values().data(), 4, MPI_INT, all.data(), 4, MPI_INT, comm_, &request);
-        bench::complete(request, bench::Waiting::Yield);
+        bench::complete(request);
         std::vector<Layer> layers;
         for (int rank = 0; rank < size_; ++rank) {
             const int* part = all.data() + 4 * rank;

@@ -113,7 +113,7 @@ void barrier()
 {
     MPI_Request request = MPI_REQUEST_NULL;
     MPI_Ibarrier(MPI_COMM_WORLD, &request);
-    bench::complete(request, bench::Waiting::Yield);
+    bench::complete(request);
 }
 
 void set(const Client& client, Way way, int size)
@@ -148,7 +148,7 @@ void timeFrame(Client& client, Way way, const Images& images, bool counts)
     MPI_Iallreduce(&seconds, &longest, 1, MPI_DOUBLE, MPI_MAX, MPI_COMM_WORLD, &requests[0]);
     MPI_Iallreduce(&cpu, &all, 1, MPI_DOUBLE, MPI_SUM, MPI_COMM_WORLD, &requests[1]);
     for (MPI_Request& request : requests)
-        bench::complete(request, bench::Waiting::Yield);
+        bench::complete(request);
     if (!counts)
         return;
     client.seconds.push_back(longest);
@@ -166,7 +166,7 @@ int run(int count, char** words)
     MPI_Comm_size(MPI_COMM_WORLD, &ranks);
     const Api icet("IceT", words[1]), dfb("dfb_icet", words[2]);
     bench::IceTTraffic traffic;
-    bench::IceTMpi mpi(MPI_COMM_WORLD, bench::Waiting::Yield, traffic);
+    bench::IceTMpi mpi(MPI_COMM_WORLD, traffic);
     IceTCommunicator (*create)(MPI_Comm) = nullptr;
     dfb.find(create, "icetCreateMPICommunicator");
     std::vector<Client> clients;
