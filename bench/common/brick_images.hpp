@@ -2,6 +2,8 @@
 // rank has one brick of a cube, seen obliquely from above, as a ray marcher would render it.
 #pragma once
 
+#include "brick_grid.hpp"
+
 #include <dfb/testing/reference.hpp>
 
 #include <algorithm>
@@ -171,15 +173,9 @@ private:
 class BrickScene : public Scene {
 public:
     // `turn`: how far the camera has gone round the cube, in radians.
-    BrickScene(int ranks, int width, int height, double turn = 0) : Scene(ranks, width, height), azimuth_(0.6 + turn)
+    BrickScene(int ranks, int width, int height, double turn = 0)
+        : Scene(ranks, width, height), azimuth_(0.6 + turn), cells_(BrickGrid(ranks).cells)
     {
-        for (int left = ranks, axis = 0; left > 1; axis = (axis + 1) % 3) { // 2: 2x1x1, 4: 2x2x1, 8: 2x2x2, 16: 4x2x2
-            int factor = 2;
-            while (left % factor != 0)
-                ++factor;
-            cells_[static_cast<std::size_t>(axis)] *= factor;
-            left /= factor;
-        }
         // Front to back: in a grid of equal bricks that is the order of their centres along the view.
         std::vector<int> sorted = order();
         std::sort(sorted.begin(), sorted.end(), [this](int a, int b) { return centreDepth(a) < centreDepth(b); });
@@ -256,7 +252,7 @@ private:
     }
 
     double azimuth_;
-    std::array<int, 3> cells_{1, 1, 1};
+    std::array<int, 3> cells_;
 };
 
 } // namespace bench
