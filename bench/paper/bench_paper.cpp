@@ -118,7 +118,7 @@ private:
 
     PaperScene scene() const
     {
-        return o_.figure == 6   ? bench::mixingLayer(o_.scaled(128), o_.seed, 6)
+        return o_.figure == 6   ? bench::mixingLayer(o_.scaled(128), o_.seed)
                : o_.figure == 7 ? bench::particleWeb(o_.scaled(64), o_.seed)
                                 : bench::channelFlow(o_.scaled(128), o_.seed);
     }

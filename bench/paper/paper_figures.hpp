@@ -70,7 +70,6 @@ inline void drawFigure(int figure, const std::string& caption, const std::vector
                      [&](const Measurement& m) { return sizeText(m) == size; });
         return some;
     };
-    const std::pair<std::string, std::string> parts{"local rendering", "compositing overhead"};
     PaperPlots plots(caption, figure == 9 ? sizes.size() : 2);
     const char* const rate = "frames/s (dashed: ideal)";
     if (figure == 6)
@@ -85,7 +84,7 @@ inline void drawFigure(int figure, const std::string& caption, const std::vector
                 groups.back().second.push_back(
                     barOf(m, std::to_string(m.result.ranks), static_cast<int>(groups.size()) - 1));
         }
-        plots.addBars("(b) parts of the time, by ranks", parts, groups);
+        plots.addBars("(b) parts of the time, by ranks", groups);
     }
     if (figure == 9) {
         for (const std::string& size : sizes)
@@ -101,7 +100,7 @@ inline void drawFigure(int figure, const std::string& caption, const std::vector
                 const auto colour = std::find(names.begin(), names.end(), titleOf(m)) - names.begin();
                 groups.back().second.push_back(barOf(m, m.result.system, static_cast<int>(colour)));
             }
-            plots.addBars(size, parts, groups);
+            plots.addBars(size, groups);
         }
     }
     if (figure == 10)
@@ -116,7 +115,7 @@ inline void drawFigure(int figure, const std::string& caption, const std::vector
                                 line.points.push_back({static_cast<double>(line.points.size()), value, value, value});
                             lines.push_back(std::move(line));
                         }
-                    plots.addCurves(ranks + ", " + size, "view", yTitle, lines);
+                    plots.addCurves(ranks + ", " + size, yTitle, lines);
                 };
                 draw("time of a frame [ms]", [](const Measurement& m) { return m.views; });
                 draw("CPU time of the busiest rank [ms]", [](const Measurement& m) { return m.busiestOfViews; });

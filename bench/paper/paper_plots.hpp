@@ -29,7 +29,7 @@ struct PlotLine {
 
 struct PlotBar {
     std::string name;                           // below it
-    double lower = 0, upper = 0, deviation = 0; // of the two parts; of their sum
+    double lower = 0, upper = 0, deviation = 0; // rendering and overhead; of their sum
     int colour = 0;
 };
 
@@ -66,9 +66,8 @@ public:
         end();
     }
 
-    // Both axes linear, y from 0; x has whole numbers.
-    void addCurves(const std::string& title, const std::string& xTitle, const std::string& yTitle,
-                   const std::vector<PlotLine>& lines)
+    // Over the number of the view; both axes linear, y from 0.
+    void addCurves(const std::string& title, const std::string& yTitle, const std::vector<PlotLine>& lines)
     {
         double right = 1, most = 0;
         for (const PlotLine& line : lines)
@@ -79,7 +78,7 @@ public:
         most *= 1.05;
         const auto x = [&](double v) { return plotWidth * v / right; };
         const auto y = [&](double v) { return plotHeight * (1 - v / most); };
-        begin(title, xTitle, yTitle);
+        begin(title, "view", yTitle);
         for (double v = 0; v <= right; v += std::max(1.0, stepOf(right)))
             tickX(x(v), number(v));
         for (double v = 0; v <= most; v += stepOf(most))
@@ -88,9 +87,8 @@ public:
         end();
     }
 
-    // Groups of bars, each with a name below; of the parts `names` says what they are.
-    void addBars(const std::string& title, const std::pair<std::string, std::string>& names,
-                 const std::vector<std::pair<std::string, std::vector<PlotBar>>>& groups)
+    // Groups of bars, each with a name below.
+    void addBars(const std::string& title, const std::vector<std::pair<std::string, std::vector<PlotBar>>>& groups)
     {
         double most = 0, places = 0;
         for (const auto& [name, bars] : groups) {
@@ -121,9 +119,9 @@ public:
             at += 0.6 * place;
         }
         box(plotWidth - 150, -50, 10, 10, "#555", 1);
-        text(plotWidth - 135, -41, names.first, "");
+        text(plotWidth - 135, -41, "local rendering", "");
         box(plotWidth - 150, -34, 10, 10, "#555", 0.4);
-        text(plotWidth - 135, -25, names.second, "");
+        text(plotWidth - 135, -25, "compositing overhead", "");
         end();
     }
 

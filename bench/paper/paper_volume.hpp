@@ -112,12 +112,12 @@ private:
 
     dfb::Vec3 toVoxel(const dfb::Vec3& p) const { return scale_ * p; } // counted from the unit cube's corner
 
-    // At least `margin` voxels from the end of what is stored.
-    bool has(const dfb::Vec3& v, int margin) const
+    // Whether the value there follows from voxels that are stored.
+    bool has(const dfb::Vec3& v) const
     {
         const auto within = [&](float at, std::size_t axis) {
-            const float from = static_cast<float>(first_[axis] + margin),
-                        to = static_cast<float>(first_[axis] + count_[axis] - 1 - margin);
+            const float from = static_cast<float>(first_[axis]),
+                        to = static_cast<float>(first_[axis] + count_[axis] - 1);
             return at >= from && at < to;
         };
         return within(v.x, 0) && within(v.y, 1) && within(v.z, 2);
@@ -240,7 +240,7 @@ private:
             normal = -1.0f * normal;
         HashedNumbers numbers(key);
         const dfb::Vec3 start = v + 1.5f * normal;
-        if (!has(start, 0))
+        if (!has(start))
             return 1;
         const bool side = at(start) < surface;
         int open = 0;
@@ -251,7 +251,7 @@ private:
             bool hit = false;
             for (float s = 2; s < look_.occlusionReach * scale_ && !hit; s += 2) {
                 const dfb::Vec3 q = start + s * to;
-                if (!has(q, 0))
+                if (!has(q))
                     break;
                 hit = (at(q) < surface) != side;
             }
@@ -269,11 +269,11 @@ private:
 };
 
 // The paper's Figure 5a: two fluids mix, in bubbles and spikes; the surfaces are where either is nearly pure.
-inline PaperScene mixingLayer(int voxels, std::uint32_t seed, int occlusionRays)
+inline PaperScene mixingLayer(int voxels, std::uint32_t seed)
 {
     VolumeLook look;
     look.surfaces = {{{0.3f, 0.35f, {0.85f, 0.35f, 0.12f}}, {0.7f, 0.45f, {0.25f, 0.5f, 0.8f}}}};
-    look.occlusionRays = occlusionRays;
+    look.occlusionRays = 6;
     look.occlusionReach = 0.08f;
     const auto field = [noise = HashedNoise(seed)](const dfb::Vec3& p) {
         const float large = noise.turbulence(p, 4, 1), fine = noise.turbulence(p, 9, 3, 0.55f);

@@ -38,7 +38,7 @@ public:
     {
         using FrameBuffer = dfb::DistributedFrameBuffer<dfb::ImageParallel>;
         hold(whole, {{0, 0, 0}, unit});
-        return wayOf<FrameBuffer>("dfb", name, format, [this, distribution](FrameBuffer& fb) {
+        return wayOf<FrameBuffer>(name, format, [this, distribution](FrameBuffer& fb) {
             const auto loop = std::make_shared<dfb::ImageParallelLoop<FrameBuffer>>(fb, distribution);
             return [this, loop](int view) { return loop->start([&](auto& tile) { render(whole, view, tile); }); };
         });
@@ -48,7 +48,7 @@ public:
     PaperWay dataParallel(const std::string& name, dfb::OutputFormat format)
     {
         using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
-        return wayOf<FrameBuffer>("dfb", name, format, [this](FrameBuffer& fb) {
+        return wayOf<FrameBuffer>(name, format, [this](FrameBuffer& fb) {
             const auto world = std::make_shared<dfb::World>(worldOf(1));
             const auto loop = std::make_shared<dfb::DataParallelLoop<FrameBuffer>>(fb, *world);
             return [this, world, loop](int view) {
@@ -65,7 +65,7 @@ public:
     {
         using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
         const auto owner = std::make_shared<Owner>();
-        PaperWay way = wayOf<FrameBuffer>("dfb", name, format, [this, owner, bricksPerRank](FrameBuffer& fb) {
+        PaperWay way = wayOf<FrameBuffer>(name, format, [this, owner, bricksPerRank](FrameBuffer& fb) {
             const auto world = std::make_shared<dfb::SharedWorld>(fb, worldOf(bricksPerRank));
             const auto loop = std::make_shared<dfb::MixedParallelLoop<FrameBuffer, Owner>>(fb, *world, *owner);
             return [this, owner, world, loop](int view) {
@@ -146,7 +146,7 @@ private:
 
     // `loopOf(framebuffer)` returns what begins a frame of a view and renders this rank's part of it.
     template <class FrameBuffer, class LoopOf>
-    PaperWay wayOf(const std::string& system, const std::string& name, dfb::OutputFormat format, const LoopOf& loopOf)
+    PaperWay wayOf(const std::string& name, dfb::OutputFormat format, const LoopOf& loopOf)
     {
         dfb::FrameBufferConfig config = config_;
         config.image.format = format;
@@ -154,7 +154,7 @@ private:
         const auto report = std::make_shared<dfb::FrameReport>();
         write_ = [fb](const Trace& trace) { trace.write(*fb); };
         PaperWay way;
-        way.system = system;
+        way.system = "dfb";
         way.config = name;
         way.frame = [fb, report, start = loopOf(*fb)](int view) {
             auto frame = start(view);
