@@ -78,7 +78,7 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     addOrdered("float32, snappy", {WireFormat::Float32, snappy});
     addOrdered("within half a level, snappy", {dfb::HalfLevel{}, snappy});
     addOrdered("bytes, snappy", packedBytes);
-    addOrdered("float32, snappy if faster", {WireFormat::Float32, snappy, 0, false, dfb::CompressionMode::Auto});
+    addOrdered("float32, snappy if faster", {WireFormat::Float32, snappy, 0, dfb::CompressionMode::Auto});
 #endif
     bench::addDfb<dfb::OrderedBlend>(systems, own, inputs, "tiles of 64, in order, float32", {});
     bench::addDfb<dfb::AlphaBlend>(systems, own, inputs, "tiles of 64, float32", {});
@@ -172,8 +172,7 @@ struct Best {
     explicit Best(const std::vector<Result>& results)
         : exact(
             fastestOf(results, [](const Result& r) { return isDfb(r) && has(r, nameOf(dfb::WireFormat::Float32)); })),
-          defaults(fastestOf(results,
-                             [](const Result& r) { return isDfb(r) && r.config.rfind(bench::defaultConfig, 0) == 0; })),
+          defaults(fastestOf(results, bench::hasDefaults)),
           oneLevel(fastestOf(results, [](const Result& r) { return isDfb(r) && r.levels <= 1; })),
           limit(fastestOf(results, [](const Result& r) { return r.system == "limit"; })),
           icetFloat(fastestOf(results, [](const Result& r) { return r.system == "icet" && has(r, "float, "); })),

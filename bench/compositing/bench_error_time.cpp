@@ -34,7 +34,7 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
         bench::addImages(systems, connection, inputs, "in order, " + config, ImageBlend::InOrder, settings);
     };
     DfbSettings defaults;
-    defaults.isDefault = defaults.hasDefaultThreads = true;
+    defaults.hasDefaultThreads = true;
     bench::addImages(systems, dfb::connect<dfb::MpiTransport>(inputs.comm), inputs, bench::defaultConfig,
                      ImageBlend::ByDepth, defaults);
     add("float32", {});
@@ -95,7 +95,7 @@ public:
         for (System& s : systems) {
             describe(s, "bricks", o_.width, o_.height);
             if (rank_ == 0)
-                (s.output == "float" ? floats_ : bytes_).push_back({s.result, s.output, s.isDefault});
+                (s.output == "float" ? floats_ : bytes_).push_back(s.result);
         }
     }
 
@@ -186,7 +186,7 @@ public:
             bench::takeResult(comm_, s, exact); // before the next one's image is in the framebuffer
             describe(s, "noise", width, height);
             if (rank_ == 0)
-                noise_.push_back({s.result, s.output, s.isDefault});
+                noise_.push_back(s.result);
         }
     }
 
@@ -246,23 +246,20 @@ public:
         for (const auto* rows : {&floats_, &bytes_, &noise_}) {
             if (rows->empty())
                 continue;
-            std::vector<Result> these;
-            for (const Row& r : *rows)
-                these.push_back(r.result);
-            results.insert(results.end(), these.begin(), these.end());
-            const std::string head = "\n| " + these.front().scene + ", " + std::to_string(size_) + " ranks, to "
-                                     + rows->front().output
+            results.insert(results.end(), rows->begin(), rows->end());
+            const std::string head = "\n| " + rows->front().scene + ", " + std::to_string(size_) + " ranks, to "
+                                     + (rows == &bytes_ ? "8 bit" : "float")
                                      + " | ms | CPU ms | MB sent | max error | RMSE | levels off |\n"
                                        "|---|--:|--:|--:|--:|--:|--:|\n";
             all << head;
             chosen << head;
-            for (const Row& r : *rows) {
-                all << line(r.result, these);
-                if (r.isDefault || isOnFront(r.result, these) || isBestOfKind(r.result, these) || rows == &noise_)
-                    chosen << line(r.result, these);
+            for (const Result& r : *rows) {
+                all << line(r, *rows);
+                if (bench::hasDefaults(r) || isOnFront(r, *rows) || isBestOfKind(r, *rows) || rows == &noise_)
+                    chosen << line(r, *rows);
             }
-            for (const Row& r : *rows)
-                if (r.isDefault && !isOnFront(r.result, these))
+            for (const Result& r : *rows)
+                if (bench::hasDefaults(r) && !isOnFront(r, *rows))
                     all << "\nThe defaults are not on the front.\n", chosen << "\nThe defaults are not on the front.\n";
         }
         for (std::ostringstream* table : {&all, &chosen}) {
@@ -281,12 +278,6 @@ public:
     }
 
 private:
-    struct Row {
-        Result result;
-        std::string output;
-        bool isDefault;
-    };
-
     // The fastest of a peer's strategies with this kind of pixels.
     static bool isBestOfKind(const Result& r, const std::vector<Result>& all)
     {
@@ -323,7 +314,7 @@ private:
     MPI_Comm comm_;
     Options o_;
     int rank_, size_;
-    std::vector<Row> floats_, bytes_, noise_; // on rank 0
+    std::vector<Result> floats_, bytes_, noise_; // on rank 0
     std::vector<Kernel> kernels_;
 };
 

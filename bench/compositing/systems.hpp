@@ -86,8 +86,7 @@ struct Compositor {
 struct System {
     std::string name, config, output;  // output: of the image, "float" or "8 bit"
     std::function<Compositor()> start; // collective, as is the end of what it returns
-    bool isDefault = false;
-    int copied = 0; // bytes a pixel of each view that it keeps beside the view
+    int copied = 0;                    // bytes a pixel of each view that it keeps beside the view
     Compositor compositor{};
     std::vector<double> ms{}, cpuMs{}, yieldMs{};
     Result result{};
@@ -137,12 +136,12 @@ inline constexpr bool isOrdered = TileOp::rule == dfb::BlendRule::InOrder;
 
 // The row of a program that sets nothing.
 inline const char* const defaultConfig = "float32, defaults";
+inline bool hasDefaults(const Result& r) { return r.system == "dfb" && r.config.rfind(defaultConfig, 0) == 0; }
 
 struct DfbSettings {
     dfb::Precision wire{};
     std::shared_ptr<const dfb::Codec> codec{};
     float minTransmittance = 0;
-    bool isDefault = false;
     dfb::CompressionMode compression = dfb::CompressionMode::Always;
     bool hasThreads = false;        // a worker; otherwise the executor has none
     bool hasDefaultThreads = false; // those that a framebuffer makes by itself
@@ -222,7 +221,6 @@ void addToBoth(std::vector<System>& systems, const char* name, const std::string
         s.name = name;
         s.config = config;
         s.output = toBytes ? "8 bit" : "float";
-        s.isDefault = settings.isDefault;
         s.copied = settings.hasBytes ? 8 : settings.isShared ? 20 : 0;
         s.start = [start, toBytes] { return start(toBytes); };
         systems.push_back(std::move(s));
