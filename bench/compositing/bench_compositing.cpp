@@ -252,7 +252,7 @@ public:
             s.result.height = height;
             s.result.commit = o_.commit;
             all.push_back(s.result);
-            (s.output == "float" ? floats : bytes).push_back(s.result);
+            (s.isFloat() ? floats : bytes).push_back(s.result);
         }
         bench::appendJson(o_.json, all);
         report(std::move(floats), "float", exact.rowStep);

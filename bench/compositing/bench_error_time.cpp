@@ -95,7 +95,7 @@ public:
         for (System& s : systems) {
             describe(s, "bricks", o_.width, o_.height);
             if (rank_ == 0)
-                (s.output == "float" ? floats_ : bytes_).push_back(s.result);
+                (s.isFloat() ? floats_ : bytes_).push_back(s.result);
         }
     }
 
@@ -166,7 +166,7 @@ public:
                     take(loop.render(render, params));
                 }
             };
-            s.compositor.floats = [&fb] { return fb.image().rgba32f(); };
+            s.compositor.image = [&fb] { return fb.image().bytes(); };
             s.compositor.traffic = [bytes] { return *bytes; };
             s.compositor.trafficIsOfAll = true;
             systems.push_back(std::move(s));

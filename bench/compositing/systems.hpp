@@ -74,9 +74,8 @@ struct Inputs {
 // Makes the image, and knows what it has cost.
 struct Compositor {
     std::function<void()> frame; // collective
-    // Of the last frame on rank 0: 4 a pixel, one of the two; none, if it makes no image.
-    std::function<const float*()> floats;
-    std::function<const std::uint8_t*()> bytes;
+    // Of the last frame on rank 0: 4 floats or bytes a pixel, as the system's output says; none, if it makes no image.
+    std::function<const void*()> image;
     std::function<std::pair<std::int64_t, std::int64_t>()> traffic; // of this rank: bytes, messages
     bool trafficIsOfAll = false;
     std::function<double()> peakMemory;
@@ -91,6 +90,7 @@ struct System {
     std::vector<double> ms{}, cpuMs{}, yieldMs{};
     Result result{};
 
+    bool isFloat() const { return output == "float"; }
     std::string title() const { return name + ": " + config + ", to " + output; }
 };
 
@@ -230,14 +230,11 @@ void addToBoth(std::vector<System>& systems, const char* name, const std::string
 // Returns what does `render(renderer)` for each frame, with an object that has `dfb`, a framebuffer or an
 // ImageCompositor, and `report`, that of the last frame.
 template <class Renderer, class Render>
-Compositor compositorOf(const std::shared_ptr<Renderer>& r, bool toBytes, const Trace& trace, const Render& render)
+Compositor compositorOf(const std::shared_ptr<Renderer>& r, const Trace& trace, const Render& render)
 {
     Compositor compositor;
     compositor.frame = [r, render] { r->report = render(*r); };
-    if (toBytes)
-        compositor.bytes = [r] { return r->dfb.image().rgba8(); };
-    else
-        compositor.floats = [r] { return r->dfb.image().rgba32f(); };
+    compositor.image = [r] { return r->dfb.image().bytes(); };
     compositor.traffic = [r] { return std::make_pair(r->report.bytesSent, r->report.messagesSent); };
     compositor.trafficIsOfAll = true;
     compositor.peakMemory = [r] { return static_cast<double>(r->report.peakMemoryBytes); };
@@ -267,7 +264,7 @@ inline void addImages(std::vector<System>& systems, const std::shared_ptr<Connec
         const auto r = std::make_shared<Renderer>(connection, blend, c);
         for (const View& view : inputs.views)
             r->images.emplace_back(r->dfb, view.image, settings);
-        return compositorOf(r, toBytes, trace, [blend, &inputs](Renderer& by) {
+        return compositorOf(r, trace, [blend, &inputs](Renderer& by) {
             const DfbImage& pixels = by.images[inputs.frame % by.images.size()];
             dfb::InputImage image;
             image.rgba32f = pixels.color;
@@ -313,7 +310,7 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
         const auto r = std::make_shared<Renderer>(connection, c);
         for (const View& view : inputs.views)
             r->images.emplace_back(r->dfb, view.image, settings);
-        return compositorOf(r, toBytes, trace, [&inputs, isToldOrder = settings.isToldOrder](Renderer& by) {
+        return compositorOf(r, trace, [&inputs, isToldOrder = settings.isToldOrder](Renderer& by) {
             const PartialImage& image = inputs.image();
             const DfbImage& pixels = by.images[inputs.frame % by.images.size()];
             const auto renderBrick = dfb::inPlace([&image, &pixels](const dfb::Brick&, auto& view) {
@@ -353,10 +350,7 @@ void addPlain(std::vector<System>& systems, const Inputs& inputs, const std::str
         const auto out = std::make_shared<const std::byte*>(nullptr);
         Compositor compositor;
         compositor.frame = [plain, out, &inputs] { *out = plain->composite(inputs.image().rgba); };
-        if (toBytes)
-            compositor.bytes = [out] { return reinterpret_cast<const std::uint8_t*>(*out); };
-        else
-            compositor.floats = [out] { return reinterpret_cast<const float*>(*out); };
+        compositor.image = [out] { return *out; };
         compositor.traffic = [plain] { return std::make_pair(plain->bytesSent(), plain->messagesSent()); };
         return compositor;
     });
@@ -448,10 +442,7 @@ inline void addIceT(std::vector<System>& systems, const Inputs& inputs)
                         *out = own;
                     }
                 };
-                if (way == Way::Floats)
-                    compositor.floats = [out] { return static_cast<const float*>(*out); };
-                else
-                    compositor.bytes = [out] { return static_cast<const std::uint8_t*>(*out); };
+                compositor.image = [out] { return *out; };
                 compositor.traffic = [icet] { return std::make_pair(icet->bytesSent(), icet->messagesSent()); };
                 return compositor;
             };
@@ -469,9 +460,11 @@ inline std::uint8_t levelOf(float value)
     return static_cast<std::uint8_t>(std::nearbyint(255 * std::min(std::max(0.0, static_cast<double>(value)), 1.0)));
 }
 
-// Of an image, 4 values a pixel, one of the two.
-inline dfb::testing::ErrorReport errorOf(const float* floats, const std::uint8_t* bytes, const ExactImage& exact)
+// Of an image, 4 floats or bytes a pixel.
+inline dfb::testing::ErrorReport errorOf(const void* image, bool isFloat, const ExactImage& exact)
 {
+    const auto* floats = isFloat ? static_cast<const float*>(image) : nullptr;
+    const auto* bytes = static_cast<const std::uint8_t*>(image);
     dfb::testing::ErrorReport report;
     const std::size_t row = 4 * static_cast<std::size_t>(exact.width);
     for (std::size_t i = 0; i < 4 * exact.pixels.size(); ++i) {
@@ -505,10 +498,8 @@ inline void timeFrame(MPI_Comm comm, FrameTimer& timer, System& s, bool counts, 
     const double start = timer.clock(), cpuBefore = processCpuSeconds(), yieldedBefore = yieldedSeconds();
     s.compositor.frame();
     static volatile std::uint64_t seen = 0;
-    if (readPixels > 0 && s.compositor.floats && s.compositor.floats())
-        seen = seen ^ readAll(s.compositor.floats(), 16 * readPixels);
-    if (readPixels > 0 && s.compositor.bytes && s.compositor.bytes())
-        seen = seen ^ readAll(s.compositor.bytes(), 4 * readPixels);
+    if (readPixels > 0 && s.compositor.image && s.compositor.image())
+        seen = seen ^ readAll(s.compositor.image(), (s.isFloat() ? 16 : 4) * readPixels);
     const double end = timer.clock(), cpu = processCpuSeconds() - cpuBefore, yielded = yieldedSeconds() - yieldedBefore;
     const double first = reduce(comm, start, MPI_MIN);
     const double cpuOfAll = reduce(comm, cpu, MPI_SUM), yieldedByAll = reduce(comm, yielded, MPI_SUM);
@@ -536,9 +527,8 @@ inline void takeResult(MPI_Comm comm, System& s, const ExactImage& exact)
         r.bytes = reduce(comm, r.bytes, MPI_SUM);
         r.messages = reduce(comm, r.messages, MPI_SUM);
     }
-    if (rankIn(comm) == 0 && (s.compositor.floats || s.compositor.bytes)) {
-        const dfb::testing::ErrorReport e = errorOf(s.compositor.floats ? s.compositor.floats() : nullptr,
-                                                    s.compositor.bytes ? s.compositor.bytes() : nullptr, exact);
+    if (rankIn(comm) == 0 && s.compositor.image) {
+        const dfb::testing::ErrorReport e = errorOf(s.compositor.image(), s.isFloat(), exact);
         r.maxError = e.maxAbs;
         r.rmse = e.rmse();
         r.levels = e.maxLevels;
@@ -582,7 +572,7 @@ inline void takeErrorsOfFloats(std::vector<System>& systems)
 {
     for (System& s : systems)
         for (const System& f : systems)
-            if (s.output == "8 bit" && f.output == "float" && s.name == f.name && s.config == f.config) {
+            if (!s.isFloat() && f.isFloat() && s.name == f.name && s.config == f.config) {
                 s.result.maxError = f.result.maxError;
                 s.result.rmse = f.result.rmse;
             }
