@@ -25,6 +25,13 @@ struct PartialImage {
     std::vector<float> rgba;       // premultiplied, 4 a pixel
     std::vector<float> depth;      // infinite where there is nothing
 
+    // Makes all pixels that are stored empty.
+    void clear()
+    {
+        const std::size_t pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
+        rgba.assign(4 * pixels, 0.0f);
+        depth.assign(pixels, std::numeric_limits<float>::infinity());
+    }
     // The index of a pixel of the image, which must be stored.
     std::size_t indexOf(int x, int y) const
     {
@@ -63,15 +70,12 @@ public:
         PartialImage image;
         image.width = width_;
         image.height = height_;
-        const std::size_t pixels = static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_);
-        image.rgba.assign(4 * pixels, 0.0f);
-        image.depth.assign(pixels, std::numeric_limits<float>::infinity());
+        image.clear();
         const auto [left, top, columns, rows] = boundsOf(rank);
         int x0 = width_, y0 = height_, x1 = 0, y1 = 0;
         for (int y = top; y < top + rows; ++y)
             for (int x = left; x < left + columns; ++x) {
-                const std::size_t i =
-                    static_cast<std::size_t>(y) * static_cast<std::size_t>(width_) + static_cast<std::size_t>(x);
+                const std::size_t i = image.indexOf(x, y);
                 if (!shade(rank, x, y, &image.rgba[4 * i], image.depth[i]))
                     continue;
                 x0 = std::min(x0, x), x1 = std::max(x1, x + 1);
@@ -92,9 +96,7 @@ public:
         image.top = y0 / tileSize * tileSize;
         image.width = std::min((x0 + columns + tileSize - 1) / tileSize * tileSize, width_) - image.left;
         image.height = std::min((y0 + rows + tileSize - 1) / tileSize * tileSize, height_) - image.top;
-        const std::size_t pixels = static_cast<std::size_t>(image.width) * static_cast<std::size_t>(image.height);
-        image.rgba.assign(4 * pixels, 0.0f);
-        image.depth.assign(pixels, std::numeric_limits<float>::infinity());
+        image.clear();
         for (int y = y0; y < y0 + rows; ++y)
             for (int x = x0; x < x0 + columns; ++x) {
                 const std::size_t i = image.indexOf(x, y);

@@ -36,10 +36,7 @@ public:
     {
         const auto [x, y, columns, rows] = image.viewport;
         for (int row = y; row < y + rows; ++row) {
-            const std::size_t first =
-                4
-                * (static_cast<std::size_t>(row) * static_cast<std::size_t>(image.width) + static_cast<std::size_t>(x));
-            const float* from = image.rgba.data() + first;
+            const float* from = image.rgba.data() + 4 * image.indexOf(x, row);
             std::uint32_t any = 0;
             for (int i = 0; i < 4 * columns; ++i) {
                 std::uint32_t bits = 0;

@@ -315,8 +315,7 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
             const DfbImage& pixels = by.images[inputs.frame % by.images.size()];
             const auto renderBrick = dfb::inPlace([&image, &pixels](const dfb::Brick&, auto& view) {
                 view.stride = static_cast<std::size_t>(image.width);
-                const std::size_t first =
-                    static_cast<std::size_t>(view.region.y0) * view.stride + static_cast<std::size_t>(view.region.x0);
+                const std::size_t first = image.indexOf(view.region.x0, view.region.y0);
                 view.color = pixels.color ? pixels.color + 4 * first : nullptr;
                 view.color8 = pixels.color8 ? pixels.color8 + 4 * first : nullptr;
                 view.depth = pixels.depth + first;
@@ -430,8 +429,7 @@ inline void addIceT(std::vector<System>& systems, const Inputs& inputs)
                     std::uint8_t* const own = bytes->empty() ? nullptr : (*bytes)[inputs.frame % bytes->size()].data();
                     if (way == Way::BytesOfFloats)
                         for (int y = v[1]; y < v[1] + v[3]; ++y) {
-                            const auto row = static_cast<std::size_t>(y) * static_cast<std::size_t>(first.width);
-                            const std::size_t at = 4 * (row + static_cast<std::size_t>(v[0]));
+                            const std::size_t at = 4 * inputs.image().indexOf(v[0], y);
                             convert(&rgba[at], 4 * static_cast<std::size_t>(v[2]), own + at);
                         }
                     icet->resetTraffic();
