@@ -3,6 +3,7 @@
 #pragma once
 
 #include "brick_grid.hpp"
+#include "clip.hpp"
 #include "frame_times.hpp"
 #include "systems.hpp"
 
@@ -15,7 +16,6 @@
 #include <cstdint>
 #include <deque>
 #include <functional>
-#include <limits>
 #include <memory>
 #include <optional>
 #include <string>
@@ -48,15 +48,9 @@ public:
     shade(const dfb::PerspectiveCamera& camera, int x, int y, int width, int height, float* rgba) const
     {
         const dfb::Vec3 eye = camera.eye(), d = camera.direction(x + 0.5, y + 0.5, width, height);
-        float first = 0, last = std::numeric_limits<float>::max();
-        const auto clip = [&](float lower, float upper, float from, float along) {
-            const float a = (lower - from) / along, b = (upper - from) / along;
-            first = std::max(first, std::min(a, b));
-            last = std::min(last, std::max(a, b));
-        };
-        clip(box_.lower.x, box_.upper.x, eye.x, d.x);
-        clip(box_.lower.y, box_.upper.y, eye.y, d.y);
-        clip(box_.lower.z, box_.upper.z, eye.z, d.z);
+        float first = 0, last = 0;
+        if (!clip(box_, 0, eye, d, first, last))
+            return first;
         constexpr float step = 1.0f / voxels;
         float through = 1;
         for (float k = std::ceil(first / step); k * step < last; ++k) { // the same samples, however space is cut

@@ -4,6 +4,7 @@
 //   bench_skip --frames-of full|empty [--frames N] [--size ...] [--trace FILE]
 //                                                       N frames of that and nothing else, for profilers
 // The exit status is 1 if a claim of counts does not hold. Times are shown, as a machine may have other work.
+#include "clip.hpp"
 #include "counted_transport.hpp"
 #include "options.hpp"
 #include "plot.hpp"
@@ -24,7 +25,6 @@
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
-#include <limits>
 #include <memory>
 #include <numeric>
 #include <optional>
@@ -237,16 +237,8 @@ OrbitTiles orbitAround(int width, int height, double renderUs)
     };
     const auto hits = [&](const dfb::Box3& box, const dfb::PerspectiveCamera& camera, int x, int y) {
         const dfb::Vec3 eye = camera.eye(), d = camera.direction(x + 0.5, y + 0.5, width, height);
-        float enter = 0, leave = std::numeric_limits<float>::infinity();
-        const auto clip = [&](float lower, float upper, float from, float by) {
-            const float a = (lower - from) / by, b = (upper - from) / by;
-            enter = std::max(enter, std::min(a, b));
-            leave = std::min(leave, std::max(a, b));
-        };
-        clip(box.lower.x, box.upper.x, eye.x, d.x);
-        clip(box.lower.y, box.upper.y, eye.y, d.y);
-        clip(box.lower.z, box.upper.z, eye.z, d.z);
-        return enter < leave;
+        float enter = 0, leave = 0;
+        return bench::clip(box, 0, eye, d, enter, leave) && enter < leave;
     };
     OrbitTiles tiles;
     std::atomic<std::int64_t> rendered{0};
