@@ -4,6 +4,7 @@
 #include "figures.hpp"
 
 #include <array>
+#include <cstddef>
 #include <cstdio>
 #include <cstdlib>
 #include <functional>
@@ -26,7 +27,9 @@ inline std::vector<std::string> partsOf(const std::string& text, char separator)
 // Reads "1024x768". Returns false if it is no size, or a side is smaller than 16.
 inline bool readSize(const std::string& text, int& width, int& height)
 {
-    return std::sscanf(text.c_str(), "%dx%d", &width, &height) == 2 && width >= 16 && height >= 16;
+    int end = 0;
+    return std::sscanf(text.c_str(), "%dx%d%n", &width, &height, &end) == 2 && text[static_cast<std::size_t>(end)] == 0
+           && width >= 16 && height >= 16;
 }
 
 // A reader of "1024x768,..." into `sizes`.

@@ -455,9 +455,8 @@ double radixMs(const Network& n, const std::vector<std::array<int, 4>>& viewport
 
 struct Options {
     std::vector<int> ranks;
-    std::vector<std::array<int, 2>> sizes;
     std::vector<std::string> scenes{"bricks", "discs"};
-    int frames = 3;
+    int width = 0, height = 0, frames = 3;
     bool quick = false;
     // As measured between 4 hosts as network namespaces of one machine, 1 Gbit/s, 50 us.
     Network rig{"rig", 53, 14.4, 26, 8.5e-3};
@@ -484,9 +483,6 @@ public:
     }
 
 private:
-    int width() const { return o_.sizes.front()[0]; }
-    int height() const { return o_.sizes.front()[1]; }
-
     template <class Get>
     static std::pair<double, double> medianAndMost(std::size_t count, const Get& get)
     {
@@ -532,8 +528,8 @@ private:
                            "credit, all ranks", "at most", "new bricks: messages", "most", "memory [MB]", "most",
                            "rank 0 takes", "ms"});
         for (const int ranks : o_.ranks) {
-            const auto scene = sceneOf(sceneName, ranks, width(), height());
-            const dfb::TileLayout layout(width(), height(), tileSize);
+            const auto scene = sceneOf(sceneName, ranks, o_.width, o_.height);
+            const dfb::TileLayout layout(o_.width, o_.height, tileSize);
             std::vector<bench::PartialImage> images(static_cast<std::size_t>(ranks));
             std::vector<std::vector<Input>> inputs;
             for (int rank = 0; rank < ranks; ++rank) {
@@ -543,7 +539,8 @@ private:
             }
             const std::vector<Expected> expected =
                 expectedOf(inputs, layout, dfb::FrameBufferConfig().messages.poolBytes);
-            const Measured m = measure(images, width(), height(), std::max(2, o_.frames), std::exchange(o_.trace, {}));
+            const Measured m =
+                measure(images, o_.width, o_.height, std::max(2, o_.frames), std::exchange(o_.trace, {}));
             MessageCount all, formula, credits;
             std::int64_t mostCredits = 0;
             for (std::size_t r = 0; r < images.size(); ++r) {
@@ -584,7 +581,7 @@ private:
             r.config = "counted, a frame";
             r.scene = sceneName;
             r.ranks = ranks;
-            r.width = width(), r.height = height();
+            r.width = o_.width, r.height = o_.height;
             r.ms = bench::figureOf(m.ms);
             r.cpuMs = bench::figureOf(m.cpuMs);
             r.bytes = static_cast<double>(all.bytes);
@@ -602,7 +599,7 @@ private:
             r.more = more;
             results_.push_back(std::move(r));
         }
-        const std::string title = sceneName + ", " + std::to_string(width()) + 'x' + std::to_string(height())
+        const std::string title = sceneName + ", " + std::to_string(o_.width) + 'x' + std::to_string(o_.height)
                                   + ": what a rank sends in a frame; the median of the ranks, and the rank with most";
         print(sent, title);
     }
@@ -618,9 +615,9 @@ private:
             for (std::size_t i = 0; i < systems.size(); ++i)
                 lines.push_back({systems[i] + ", " + network.name, {}, i, network.name == "rig"});
         }
-        const dfb::TileLayout layout(width(), height(), tileSize);
+        const dfb::TileLayout layout(o_.width, o_.height, tileSize);
         for (int ranks = 2; ranks <= (o_.quick ? 1024 : 16384); ranks *= 2) {
-            const auto scene = sceneOf("bricks", ranks, width(), height());
+            const auto scene = sceneOf("bricks", ranks, o_.width, o_.height);
             std::vector<std::vector<Input>> inputs;
             std::vector<std::array<int, 4>> viewports;
             bench::PartialImage image;
@@ -634,7 +631,7 @@ private:
             for (std::size_t n = 0; n < networks.size(); ++n) {
                 std::vector<double> ms{dfbMs(networks[n], expected, o_.costs)};
                 for (const int most : {2, 4, 8})
-                    ms.push_back(radixMs(networks[n], viewports, scene->order(), width(), height(), most, o_.costs));
+                    ms.push_back(radixMs(networks[n], viewports, scene->order(), o_.width, o_.height, most, o_.costs));
                 std::vector<std::string> row{std::to_string(ranks)};
                 for (std::size_t s = 0; s < systems.size(); ++s) {
                     row.push_back(bench::text(ms[s]));
@@ -645,7 +642,7 @@ private:
                     r.config = "LogGP, " + networks[n].name;
                     r.scene = "bricks";
                     r.ranks = ranks;
-                    r.width = width(), r.height = height();
+                    r.width = o_.width, r.height = o_.height;
                     r.ms.median = ms[s];
                     r.commit = o_.commit;
                     results_.push_back(std::move(r));
@@ -659,7 +656,7 @@ private:
                 title, sizeof title,
                 "LogGP, %s: L %g us, o %g us, g %g us, G %g ns a byte; %.2f and %.2f ns a pixel; bricks, %dx%d",
                 networks[n].name.c_str(), networks[n].latency, networks[n].overhead, networks[n].gap,
-                1e3 * networks[n].perByte, o_.costs.dfbNs, o_.costs.plainNs, width(), height());
+                1e3 * networks[n].perByte, o_.costs.dfbNs, o_.costs.plainNs, o_.width, o_.height);
             print(tables[n], title);
         }
         if (!o_.svg.empty())
@@ -705,8 +702,8 @@ Options optionsOf(int argc, char** argv)
                            [](const std::string& name) { return name == "bricks" || name == "discs"; });
     };
     const auto readSize = [&](const std::string& value) {
-        return bench::readSizes(o.sizes)(value) && o.sizes.size() == 1 && o.sizes[0][0] % tileSize == 0
-               && o.sizes[0][1] % tileSize == 0; // so that all tiles are as large
+        return bench::readSize(value, o.width, o.height) && o.width % tileSize == 0
+               && o.height % tileSize == 0; // so that all tiles are as large
     };
     bench::readOptions(
         argc, argv,
@@ -736,8 +733,8 @@ Options optionsOf(int argc, char** argv)
     if (o.ranks.empty())
         o.ranks =
             o.quick ? std::vector<int>{2, 8, 64, 256} : std::vector<int>{2, 4, 8, 16, 32, 64, 128, 256, 512, 1024};
-    if (o.sizes.empty())
-        o.sizes = {o.quick ? std::array<int, 2>{1024, 1024} : std::array<int, 2>{2048, 2048}};
+    if (o.width == 0)
+        o.width = o.height = o.quick ? 1024 : 2048;
     return o;
 }
 

@@ -20,7 +20,6 @@
 #include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
-#include <array>
 #include <atomic>
 #include <cmath>
 #include <cstdio>
@@ -407,8 +406,7 @@ Sampling sample(int width, int height)
 // ---- the program
 
 struct Options {
-    std::vector<std::array<int, 2>> sizes{{1024, 1024}};
-    int frames = 0;
+    int width = 1024, height = 1024, frames = 0;
     bool quick = false;
     std::string framesOf, json, svg, table, trace, commit;
 };
@@ -433,13 +431,11 @@ public:
     }
 
 private:
-    int width() const { return o_.sizes.front()[0]; }
-    int height() const { return o_.sizes.front()[1]; }
-    std::string sizeText() const { return std::to_string(width()) + 'x' + std::to_string(height()); }
+    std::string sizeText() const { return std::to_string(o_.width) + 'x' + std::to_string(o_.height); }
     Settings settings() const
     {
         Settings s;
-        s.width = width(), s.height = height(), s.frames = o_.frames;
+        s.width = o_.width, s.height = o_.height, s.frames = o_.frames;
         return s;
     }
 
@@ -460,7 +456,7 @@ private:
         r.config = config;
         r.scene = "square";
         r.ranks = ranks;
-        r.width = width(), r.height = height();
+        r.width = o_.width, r.height = o_.height;
         r.ms = cost.ms;
         r.bytes = static_cast<double>(cost.all.bytes);
         r.messages = static_cast<double>(cost.all.messages);
@@ -476,7 +472,7 @@ private:
         bench::PlotLine bytesLine{"bytes", {}, 0}, timeLine{"time", {}, 1};
         FrameCost full;
         for (const double percent : {100.0, 50.0, 25.0, 10.0, 1.0, 0.0}) {
-            const Picture picture(width(), height(), percent / 100);
+            const Picture picture(o_.width, o_.height, percent / 100);
             const FrameCost cost = framesOf<dfb::AlphaBlend>(picture, settings());
             if (percent == 100)
                 full = cost;
@@ -539,7 +535,7 @@ private:
     {
         Settings s = settings();
         s.frames = 2;
-        const FrameCost cost = framesOf<dfb::AlphaBlend>(Picture(width(), height(), 0.25), s);
+        const FrameCost cost = framesOf<dfb::AlphaBlend>(Picture(o_.width, o_.height, 0.25), s);
         claim("manifests and answers in a second frame with the same bricks and camera",
               static_cast<double>(cost.manifests.messages), "%.0f", 0);
     }
@@ -547,7 +543,7 @@ private:
     void measureChannels()
     {
         const double share = 0.25;
-        const Picture picture(width(), height(), share);
+        const Picture picture(o_.width, o_.height, share);
         Settings s = settings();
         s.frames = 2;
         constexpr dfb::ChannelMask more = dfb::normalChannel | dfb::albedoChannel;
@@ -585,12 +581,12 @@ private:
         Settings s = settings();
         s.frames = 3;
         s.renderUs = 200;
-        const FrameCost translucent = framesOf<dfb::OrderedBlend>(Picture(width(), height(), 0.25), s);
-        const FrameCost opaque = framesOf<dfb::OrderedBlend>(Picture(width(), height(), 0.25, 1), s);
+        const FrameCost translucent = framesOf<dfb::OrderedBlend>(Picture(o_.width, o_.height, 0.25), s);
+        const FrameCost opaque = framesOf<dfb::OrderedBlend>(Picture(o_.width, o_.height, 0.25, 1), s);
         claim("4 ranks with the same pixels in order, the front one's opaque: bytes of inputs, % of translucent ones'",
               ofFull(opaque.inputs.bytes, translucent.inputs.bytes), "%.1f", 25, Sort::Shown);
         claim("tiles rendered, %", ofFull(opaque.rendered, translucent.rendered), "%.1f", 35, Sort::Shown);
-        const OrbitTiles orbit = orbitAround(width(), height(), 200);
+        const OrbitTiles orbit = orbitAround(o_.width, o_.height, 200);
         const auto percent = [&](std::int64_t of) {
             return 100 * static_cast<double>(of) / static_cast<double>(orbit.all);
         };
@@ -628,9 +624,6 @@ private:
 Options optionsOf(int argc, char** argv)
 {
     Options o;
-    const auto readSize = [&](const std::string& value) {
-        return bench::readSizes(o.sizes)(value) && o.sizes.size() == 1;
-    };
     const auto readContent = [&](const std::string& value) {
         o.framesOf = value;
         return value == "full" || value == "empty";
@@ -641,7 +634,7 @@ Options optionsOf(int argc, char** argv)
         "ID]\n"
         "       bench_skip --frames-of full|empty [--size WxH] [--frames N] [--trace FILE]\n"
         "  --frames-of  renders so many frames of a full or an empty image and measures nothing: for a profiler",
-        {{"--size", readSize},
+        {{"--size", [&o](const std::string& value) { return bench::readSize(value, o.width, o.height); }},
          {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
          {"--frames-of", readContent},
          {"--json", bench::readText(o.json)},
@@ -663,7 +656,7 @@ int main(int argc, char** argv)
     if (o.framesOf.empty())
         return Bench(o).run();
     Settings s;
-    s.width = o.sizes.front()[0], s.height = o.sizes.front()[1], s.frames = o.frames;
+    s.width = o.width, s.height = o.height, s.frames = o.frames;
     s.trace = o.trace;
     const FrameCost cost = framesOf<dfb::AlphaBlend>(Picture(s.width, s.height, o.framesOf == "full" ? 1 : 0), s);
     std::printf("%d frames, %s: the last sent %lld bytes in %lld messages\n", o.frames, o.framesOf.c_str(),
