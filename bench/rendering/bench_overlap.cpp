@@ -8,12 +8,12 @@
 // dfb's frames open at once, so many times in turns. --trace: of single frames, in the last size.
 #include "marched_bricks.hpp"
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdlib>
 #include <memory>
 #include <string>
-#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -21,6 +21,8 @@ namespace {
 
 using bench::Figure;
 using bench::MarchedSystem;
+using bench::MarchedView;
+using bench::Times;
 
 struct Options {
     std::vector<std::array<int, 2>> sizes{{512, 512}};
@@ -29,28 +31,52 @@ struct Options {
     std::string json, table, commit, only, trace;
 };
 
+// Of all views, in ms.
+struct Row {
+    Figure frame, beyond, overhead, cpu, cpuBeyond; // beyond: more than rendering alone takes
+};
+
+Row rowOf(const MarchedSystem& s, const MarchedSystem& alone)
+{
+    const auto figure = [&](const auto& valueOf) {
+        std::vector<double> values;
+        for (std::size_t v = 0; v < s.times.size(); ++v)
+            values.push_back(valueOf(s.times[v], alone.times[v]));
+        return bench::figureOf(values);
+    };
+    return {figure([](const Times& t, const Times&) { return t.image; }),
+            figure([](const Times& t, const Times& without) { return t.image - without.image; }),
+            figure([](const Times& t, const Times&) { return t.overhead(); }),
+            figure([](const Times& t, const Times&) { return t.cpu; }),
+            figure([](const Times& t, const Times& without) { return t.cpu - without.cpu; })};
+}
+
+// The largest difference of two images; 0 where there are none.
+double differenceOf(const float* a, const float* b, std::size_t values)
+{
+    double largest = 0;
+    for (std::size_t i = 0; a && b && i < values; ++i)
+        largest = std::max(largest, std::abs(static_cast<double>(a[i]) - static_cast<double>(b[i])));
+    return largest;
+}
+
+// Images of one size.
 class Bench {
 public:
-    Bench(MPI_Comm comm, Options o)
-        : comm_(comm), o_(std::move(o)), rank_(bench::rankIn(comm)), size_(bench::sizeOf(comm))
+    Bench(MPI_Comm comm, const Options& o, int width, int height)
+        : comm_(comm), o_(o), rank_(bench::rankIn(comm)), ranks_(bench::sizeOf(comm)), width_(width), height_(height)
     {
     }
 
-    void run(int width, int height)
+    void run()
     {
-        dfb::FrameBufferConfig config(width, height);
-        config.executor = std::make_shared<dfb::CallerExecutor>(); // one thread per rank, as IceT has
+        dfb::FrameBufferConfig config = oneThreadConfig();
         const bench::Trace trace(o_.trace);
         config.trace = trace.sink;
         bench::MarchedBricks bricks(comm_, config, o_.views, false);
         std::vector<MarchedSystem> systems{bricks.alone(), bricks.inOrder("dfb")};
-#ifdef DFB_BENCH_HAS_ICET
-        for (const bench::IceTStrategy& strategy : bench::icetStrategies()) {
-            const std::string name = strategy.name;
-            if (name == "direct" || name == "sequential, binary swap" || name == "sequential, tree")
-                systems.push_back(bricks.icet(strategy));
-        }
-#endif
+        for (MarchedSystem& peer : peersOf(bricks))
+            systems.push_back(std::move(peer));
         systems.erase(
             std::remove_if(systems.begin(), systems.end(),
                            [&](const MarchedSystem& s) { return s.image && !bench::isWanted(s.name, o_.only); }),
@@ -58,32 +84,24 @@ public:
         bench::FrameTimer timer(comm_);
         double largest = 0; // difference of two images
         const auto views = static_cast<std::size_t>(o_.views);
+        const std::size_t values = 4 * static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_);
         for (std::size_t v = 0; v <= views; ++v) { // the first touches memory
-            const bench::MarchedView& view = bricks.views()[v % views];
-            for (std::size_t i = 0; i < systems.size(); ++i) {
-                MarchedSystem& s = systems[(i + v) % systems.size()];
-                const bench::Times t = timer.time([&] { return s.frame(view); }, s.image != nullptr);
-                if (v > 0)
-                    s.times.push_back(t);
-            }
-            const float *ours = systems.size() > 2 ? systems[1].image() : nullptr,
-                        *theirs = systems.size() > 2 ? systems.back().image() : nullptr;
-            const std::size_t values = 4 * static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
-            for (std::size_t i = 0; ours && theirs && i < values; ++i)
-                largest = std::max(largest, std::abs(static_cast<double>(ours[i]) - static_cast<double>(theirs[i])));
+            takeTurns(timer, systems, v, bricks.views()[v % views]);
+            if (systems.size() > 2)
+                largest = std::max(largest, differenceOf(systems[1].image(), systems.back().image(), values));
         }
         std::vector<std::array<double, 2>> traffic; // bytes and messages, of the last frame
         for (const MarchedSystem& s : systems)
             traffic.push_back(s.traffic ? s.traffic() : std::array<double, 2>{});
-        report(systems, traffic, width, height, largest);
+        if (rank_ == 0)
+            report(systems, traffic, largest);
         bricks.write(trace);
     }
 
     // All views in a row.
-    void runInARow(int width, int height)
+    void runInARow()
     {
-        dfb::FrameBufferConfig config(width, height);
-        config.executor = std::make_shared<dfb::CallerExecutor>();
+        dfb::FrameBufferConfig config = oneThreadConfig();
         std::vector<std::unique_ptr<bench::MarchedBricks>> all;
         std::vector<MarchedSystem> systems;
         for (const int frames : {1, 2, 3}) {
@@ -91,131 +109,140 @@ public:
             all.push_back(std::make_unique<bench::MarchedBricks>(comm_, config, o_.views, false));
             systems.push_back(all.back()->inFlight("dfb, " + std::to_string(frames) + " in flight"));
         }
-        const std::vector<bench::MarchedView>& views = all.front()->views();
-        const auto eachView = [&views](const MarchedSystem& one) {
-            return MarchedSystem{one.name,
-                                 [one, &views](const bench::MarchedView&) {
-                                     double rendered = 0;
-                                     for (const bench::MarchedView& view : views)
-                                         rendered = one.frame(view);
-                                     return rendered;
-                                 },
-                                 one.image};
+        const std::vector<MarchedView>& views = all.front()->views();
+        const auto addEachView = [&](const MarchedSystem& one) {
+            const auto frame = [one, &views](const MarchedView&) {
+                double rendered = 0;
+                for (const MarchedView& view : views)
+                    rendered = one.frame(view);
+                return rendered;
+            };
+            systems.push_back({one.name, frame, one.image});
         };
-        systems.push_back(eachView(all.front()->alone()));
+        addEachView(all.front()->alone());
+        for (const MarchedSystem& peer : peersOf(*all.front()))
+            addEachView(peer);
+        bench::FrameTimer timer(comm_);
+        for (int turn = 0; turn <= o_.inARow; ++turn)
+            takeTurns(timer, systems, static_cast<std::size_t>(turn), views.front());
+        if (rank_ == 0)
+            reportInARow(systems);
+    }
+
+private:
+    // As IceT has it.
+    dfb::FrameBufferConfig oneThreadConfig() const
+    {
+        dfb::FrameBufferConfig config(width_, height_);
+        config.executor = std::make_shared<dfb::CallerExecutor>();
+        return config;
+    }
+
+    static std::vector<MarchedSystem> peersOf([[maybe_unused]] bench::MarchedBricks& bricks)
+    {
+        std::vector<MarchedSystem> peers;
 #ifdef DFB_BENCH_HAS_ICET
         for (const bench::IceTStrategy& strategy : bench::icetStrategies()) {
             const std::string name = strategy.name;
             if (name == "direct" || name == "sequential, binary swap" || name == "sequential, tree")
-                systems.push_back(eachView(all.front()->icet(strategy)));
+                peers.push_back(bricks.icet(strategy));
         }
 #endif
-        bench::FrameTimer timer(comm_);
-        for (int turn = 0; turn <= o_.inARow; ++turn)
-            for (std::size_t i = 0; i < systems.size(); ++i) {
-                MarchedSystem& s = systems[(i + static_cast<std::size_t>(turn)) % systems.size()];
-                const bench::Times t = timer.time([&] { return s.frame(views.front()); }, s.image != nullptr);
-                if (turn > 0)
-                    s.times.push_back(t);
-            }
-        if (rank_ != 0)
-            return;
+        return peers;
+    }
+
+    // A frame of each system; another one begins in each turn. The first turn does not count.
+    static void takeTurns(bench::FrameTimer& timer, std::vector<MarchedSystem>& systems, std::size_t turn,
+                          const MarchedView& view)
+    {
+        for (std::size_t i = 0; i < systems.size(); ++i) {
+            MarchedSystem& s = systems[(i + turn) % systems.size()];
+            const Times t = timer.time([&] { return s.frame(view); }, s.image != nullptr);
+            if (turn > 0)
+                s.times.push_back(t);
+        }
+    }
+
+    std::string sizeText() const { return std::to_string(width_) + 'x' + std::to_string(height_); }
+    std::string titleText() const
+    {
+        return sizeText() + ", " + std::to_string(ranks_) + " ranks, " + std::to_string(o_.views) + " views";
+    }
+
+    bench::Result resultOf(const MarchedSystem& s, const char* what, const Figure& ms, const Figure& cpuMs) const
+    {
+        bench::Result r;
+        r.bench = "bench_overlap";
+        r.system = s.name.substr(0, s.name.find_first_of(":,"));
+        r.config = s.name + what;
+        r.scene = "64^3 bricks, " + std::to_string(o_.views) + " views";
+        r.ranks = ranks_;
+        r.width = width_;
+        r.height = height_;
+        r.commit = o_.commit;
+        r.ms = ms;
+        r.cpuMs = cpuMs;
+        return r;
+    }
+
+    void reportInARow(const std::vector<MarchedSystem>& systems) const
+    {
         bench::Table table({"", "frames a second", "ms a frame", "CPU, all ranks [ms a frame]"});
         std::vector<bench::Result> results;
         for (const MarchedSystem& s : systems) {
             std::vector<double> perSecond, ms, cpu;
-            for (const bench::Times& t : s.times) {
+            for (const Times& t : s.times) {
                 perSecond.push_back(1e3 * o_.views / t.image);
                 ms.push_back(t.image / o_.views);
                 cpu.push_back(t.cpu / o_.views);
             }
-            bench::Result r;
-            r.bench = "bench_overlap";
-            r.system = s.name.substr(0, s.name.find_first_of(":,"));
-            r.config = s.name + ", in a row";
-            r.scene = "64^3 bricks, " + std::to_string(o_.views) + " views";
-            r.ranks = size_;
-            r.width = width;
-            r.height = height;
-            r.commit = o_.commit;
-            r.ms = bench::figureOf(ms);
-            r.cpuMs = bench::figureOf(cpu);
-            results.push_back(r);
-            table.add({s.name, bench::text(bench::figureOf(perSecond)), bench::text(r.ms), bench::text(r.cpuMs)});
+            results.push_back(resultOf(s, ", in a row", bench::figureOf(ms), bench::figureOf(cpu)));
+            table.add({s.name, bench::text(bench::figureOf(perSecond)), bench::text(results.back().ms),
+                       bench::text(results.back().cpuMs)});
         }
-        const std::string title = std::to_string(width) + 'x' + std::to_string(height) + ", " + std::to_string(size_)
-                                  + " ranks, " + std::to_string(o_.views) + " views in a row";
-        table.print(title);
+        table.print(titleText() + " in a row");
         bench::appendJson(o_.json, results);
     }
 
-private:
-    void report(const std::vector<MarchedSystem>& systems, const std::vector<std::array<double, 2>>& traffic, int width,
-                int height, double largest) const
+    void report(const std::vector<MarchedSystem>& systems, const std::vector<std::array<double, 2>>& traffic,
+                double largest) const
     {
-        if (rank_ != 0)
-            return;
-        const auto figure = [](const MarchedSystem& s, const auto& valueOf) {
-            std::vector<double> values;
-            for (std::size_t v = 0; v < s.times.size(); ++v)
-                values.push_back(valueOf(v));
-            return bench::figureOf(values);
-        };
-        const MarchedSystem& alone = systems.front();
-        struct Row {
-            Figure frame, beyond, overhead, cpu, cpuBeyond;
-        };
         std::vector<Row> rows;
         std::vector<bench::Result> results;
         bench::Table table({"", "frame [ms]", "beyond rendering alone [ms]", "after the slowest had rendered [ms]",
                             "CPU beyond rendering [ms]", "MB", "messages"});
         for (std::size_t i = 0; i < systems.size(); ++i) {
             const MarchedSystem& s = systems[i];
-            rows.push_back({figure(s, [&](std::size_t v) { return s.times[v].image; }),
-                            figure(s, [&](std::size_t v) { return s.times[v].image - alone.times[v].image; }),
-                            figure(s, [&](std::size_t v) { return s.times[v].overhead(); }),
-                            figure(s, [&](std::size_t v) { return s.times[v].cpu; }),
-                            figure(s, [&](std::size_t v) { return s.times[v].cpu - alone.times[v].cpu; })});
-            const Row& row = rows.back();
+            const Row row = rowOf(s, systems.front());
+            rows.push_back(row);
             const auto& [bytes, messages] = traffic[i];
             table.add({s.name, bench::text(row.frame), bench::text(row.beyond), bench::text(row.overhead),
                        bench::text(row.cpuBeyond), bench::text(1e-6 * bytes), bench::text(messages)});
-            bench::Result r;
-            r.bench = "bench_overlap";
-            r.system = s.name.substr(0, s.name.find(':'));
-            r.scene = "64^3 bricks, " + std::to_string(o_.views) + " views";
-            r.ranks = size_;
-            r.width = width;
-            r.height = height;
-            r.commit = o_.commit;
-            r.bytes = bytes;
-            r.messages = messages;
-            const std::tuple<const char*, const Figure*, const Figure*> parts[] = {
-                {", frame", &row.frame, &row.cpu},
-                {", beyond rendering", &row.beyond, &row.cpuBeyond},
-                {", overhead", &row.overhead, &row.cpu}};
-            for (const auto& [part, ms, cpu] : parts) {
-                r.config = s.name + part;
-                r.ms = *ms;
-                r.cpuMs = *cpu;
-                results.push_back(r);
+            for (bench::Result r : {resultOf(s, ", frame", row.frame, row.cpu),
+                                    resultOf(s, ", beyond rendering", row.beyond, row.cpuBeyond),
+                                    resultOf(s, ", overhead", row.overhead, row.cpu)}) {
+                r.bytes = bytes;
+                r.messages = messages;
+                results.push_back(std::move(r));
             }
         }
-        const std::string size = std::to_string(width) + 'x' + std::to_string(height);
-        std::string title = size + ", " + std::to_string(size_) + " ranks, " + std::to_string(o_.views) + " views";
+        std::string title = titleText();
         if (systems.size() > 2)
             title += "; images of " + systems[1].name + " and " + systems.back().name + " differ by "
                      + bench::text("%.2g", largest) + " at most";
         table.print(title);
         bench::appendJson(o_.json, results);
-        std::size_t best = 0; // of the peer's
-        for (std::size_t i = 2; i < rows.size(); ++i)
-            if (best == 0 || rows[i].frame.median < rows[best].frame.median)
-                best = i;
-        if (best == 0 || systems[1].name != "dfb")
-            return;
-        const Row &mine = rows[1], &peer = rows[best];
-        const std::string line = "| " + size + " | " + std::to_string(size_) + " | " + bench::text(rows[0].frame)
+        if (systems.size() > 2 && systems[1].name == "dfb")
+            compare(rows);
+    }
+
+    // Of dfb, whose row is the second, with the fastest of the peers, whose rows follow.
+    void compare(const std::vector<Row>& rows) const
+    {
+        const Row& mine = rows[1];
+        const Row& peer = *std::min_element(rows.begin() + 2, rows.end(),
+                                            [](const Row& a, const Row& b) { return a.frame.median < b.frame.median; });
+        const std::string line = "| " + sizeText() + " | " + std::to_string(ranks_) + " | " + bench::text(rows[0].frame)
                                  + " | " + bench::text(mine.frame) + " | " + bench::text(peer.frame) + " | "
                                  + bench::text(mine.frame.median / peer.frame.median) + " | " + bench::text(mine.beyond)
                                  + " | " + bench::text(peer.beyond) + " | "
@@ -231,8 +258,8 @@ private:
     }
 
     MPI_Comm comm_;
-    Options o_;
-    int rank_, size_;
+    const Options& o_;
+    int rank_, ranks_, width_, height_;
 };
 
 // Ends the program after --help, or if it was called wrongly.
@@ -265,8 +292,9 @@ int main(int argc, char** argv)
 {
     const Options options = optionsOf(argc, argv);
     bench::withMpi(argc, argv, [&](MPI_Comm comm) {
-        Bench bench(comm, options);
-        for (const auto& [width, height] : options.sizes)
-            options.inARow > 0 ? bench.runInARow(width, height) : bench.run(width, height);
+        for (const auto& [width, height] : options.sizes) {
+            Bench bench(comm, options, width, height);
+            options.inARow > 0 ? bench.runInARow() : bench.run();
+        }
     });
 }
