@@ -153,87 +153,126 @@ std::int64_t blockOf(std::int64_t bytes)
     return block;
 }
 
-std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, const dfb::TileLayout& layout,
-                                 std::size_t messagePoolBytes)
+// The tiles that a rank owns.
+struct Owned {
+    bool any = false;
+    std::int64_t seen = 0; // of which somebody has a pixel; the others are background, which does not travel
+};
+
+std::vector<Owned> ownedOf(const std::vector<std::vector<Input>>& inputs, const std::vector<int>& owners)
 {
-    const auto ranks = static_cast<int>(inputs.size());
-    std::vector<Expected> all(inputs.size());
-    const auto at = [&](int rank) -> Expected& { return all[static_cast<std::size_t>(rank)]; };
-    std::vector<int> owners(static_cast<std::size_t>(layout.tileCount()));
-    for (int tile = 0; tile < layout.tileCount(); ++tile)
-        owners[static_cast<std::size_t>(tile)] = dfb::latticeOwner(tile, layout, ranks);
-    // Finished tiles; a tile of which nobody has a pixel is background, which does not travel.
-    std::vector<bool> isTouched(owners.size());
+    std::vector<bool> isSeen(owners.size());
     for (const std::vector<Input>& some : inputs)
         for (const Input& input : some)
             if (input.activePixels > 0)
-                isTouched[static_cast<std::size_t>(input.tile)] = true;
-    constexpr std::int64_t batchBytes = 256 << 10, batchPrefix = 40, consensusBytes = 28;
-    const auto verdictBytes = consensusBytes + static_cast<std::int64_t>(dfb::detail::Verdict().bytes().size());
-    const std::int64_t agreementBytes = 2048 + 8 * ranks; // at most: what all ranks agree on at first
+                isSeen[static_cast<std::size_t>(input.tile)] = true;
+    std::vector<Owned> owned(inputs.size());
+    for (std::size_t tile = 0; tile < owners.size(); ++tile) {
+        Owned& of = owned[static_cast<std::size_t>(owners[tile])];
+        of.any = true;
+        of.seen += isSeen[tile];
+    }
+    return owned;
+}
+
+using Receivers = std::map<int, MessageCount>; // the messages to each rank that need credit
+
+// Inputs, manifests and their answers. Returns the inputs that travel.
+Receivers expectInputs(int rank, const std::vector<Input>& inputs, const std::vector<int>& owners,
+                       std::int64_t mostInput, std::vector<Expected>& all)
+{
+    Expected& e = all[static_cast<std::size_t>(rank)];
+    Receivers to;
+    for (const Input& input : inputs) {
+        const int owner = owners[static_cast<std::size_t>(input.tile)];
+        ++e.tiles;
+        e.activePixels += input.activePixels;
+        // It is made in a block that has room for any input, and stays there if it fills three quarters of that.
+        e.poolBytes += blockOf(4 * input.bytes < 3 * mostInput ? input.bytes : mostInput);
+        if (owner == rank)
+            continue;
+        to[owner].add(input.bytes);
+        e.fragments.add(input.bytes);
+        Expected& receiver = all[static_cast<std::size_t>(owner)];
+        receiver.inPixels += input.activePixels;
+        receiver.inBytes += input.bytes;
+        ++receiver.inMessages;
+    }
+    for (const auto& [owner, count] : to) {
+        e.manifests.add(24 + 10 * count.messages);
+        e.poolBytes += blockOf(24 + 10 * count.messages);
+        all[static_cast<std::size_t>(owner)].acks.add(24);
+    }
+    return to;
+}
+
+// To the display rank.
+void expectFinished(Expected& e, const Owned& owned, Receivers& to)
+{
+    constexpr std::int64_t batchBytes = 256 << 10, batchPrefix = 40;
     constexpr std::int64_t record = 16 + bytesPerOutput * tileSize * tileSize;
     constexpr std::int64_t perBatch = (batchBytes - batchPrefix) / record;
-    std::vector<std::int64_t> finished(inputs.size());
-    std::vector<bool> owns(inputs.size());
-    for (std::size_t tile = 0; tile < owners.size(); ++tile) {
-        finished[static_cast<std::size_t>(owners[tile])] += isTouched[tile];
-        owns[static_cast<std::size_t>(owners[tile])] = true;
-    }
+    const std::int64_t batches = (owned.seen + perBatch - 1) / perBatch;
+    e.finished.add(batches * batchPrefix + owned.seen * record, batches);
+    if (batches > 0)
+        to[0] += e.finished;
+    e.poolBytes += batches * batchBytes + blockOf(record);
+    if (owned.any)
+        e.done.add(32);
+}
 
+// `allowance`: the bytes that may be on the way to a rank unasked.
+void expectCredit(int rank, const Receivers& to, std::int64_t allowance, std::vector<Expected>& all)
+{
+    Expected& e = all[static_cast<std::size_t>(rank)];
+    for (const auto& [other, count] : to) {
+        const std::int64_t requests = count.bytes > allowance ? count.messages : 0;
+        const std::int64_t answers = requests + std::min(count.messages, 2 * count.bytes / allowance);
+        e.mostCredits += requests;
+        e.mostCreditsIn += answers;
+        e.asksForCredit = e.asksForCredit || requests > 0;
+        all[static_cast<std::size_t>(other)].mostCredits += answers;
+        all[static_cast<std::size_t>(other)].mostCreditsIn += requests;
+    }
+}
+
+// To the ranks above and below it in the tree.
+void expectReductions(Expected& e, int rank, int ranks)
+{
+    constexpr std::int64_t consensusBytes = 28;
+    const auto verdictBytes = consensusBytes + static_cast<std::int64_t>(dfb::detail::Verdict().bytes().size());
+    const std::int64_t agreementBytes = 2048 + 8 * ranks; // at most: what all ranks agree on at first
+    std::int64_t messages = rank != 0;
+    for (int bit = 1; bit < ranks && !(rank & bit); bit <<= 1)
+        if (rank + bit < ranks) {
+            ++messages;
+            e.poolBytes += blockOf(agreementBytes);
+        }
+    e.verdict.add(messages * verdictBytes, messages);
+    e.consensus.add(messages * consensusBytes, messages);
+}
+
+std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, const dfb::TileLayout& layout)
+{
+    const auto ranks = static_cast<int>(inputs.size());
+    std::vector<int> owners;
+    for (int tile = 0; tile < layout.tileCount(); ++tile)
+        owners.push_back(dfb::latticeOwner(tile, layout, ranks));
+    const std::vector<Owned> owned = ownedOf(inputs, owners);
     const auto mostInput = static_cast<std::int64_t>(
         dfb::detail::largestFragment(tileSize, tileSize, dfb::colorChannel | dfb::depthChannel));
-    const std::int64_t allowance = static_cast<std::int64_t>(messagePoolBytes) / 2 / (ranks - 1);
+    const auto messagePoolBytes = static_cast<std::int64_t>(dfb::FrameBufferConfig().messages.poolBytes);
+    std::vector<Expected> all(inputs.size());
     for (int rank = 0; rank < ranks; ++rank) {
-        Expected& e = at(rank);
-        std::map<int, MessageCount> to; // messages that need credit
-        for (const Input& input : inputs[static_cast<std::size_t>(rank)]) {
-            const int owner = owners[static_cast<std::size_t>(input.tile)];
-            ++e.tiles;
-            e.activePixels += input.activePixels;
-            // It is made in a block that has room for any input, and stays there if it fills three quarters of that.
-            e.poolBytes += blockOf(4 * input.bytes < 3 * mostInput ? input.bytes : mostInput);
-            if (owner == rank)
-                continue;
-            to[owner].add(input.bytes);
-            e.fragments.add(input.bytes);
-            at(owner).inPixels += input.activePixels;
-            at(owner).inBytes += input.bytes;
-            ++at(owner).inMessages;
-        }
-        for (const auto& [owner, count] : to) {
-            e.manifests.add(24 + 10 * count.messages);
-            e.poolBytes += blockOf(24 + 10 * count.messages);
-            at(owner).acks.add(24);
-        }
-        if (rank != 0) { // the display rank
-            const std::int64_t tiles = finished[static_cast<std::size_t>(rank)];
-            const std::int64_t batches = (tiles + perBatch - 1) / perBatch;
-            e.finished.add(batches * batchPrefix + tiles * record, batches);
-            if (batches > 0)
-                to[0] += e.finished;
-            e.poolBytes += batches * batchBytes + blockOf(record);
-            if (owns[static_cast<std::size_t>(rank)])
-                e.done.add(32);
-            e.verdict.add(verdictBytes);
-            e.consensus.add(consensusBytes);
-        } else {
+        const auto r = static_cast<std::size_t>(rank);
+        Expected& e = all[r];
+        Receivers to = expectInputs(rank, inputs[r], owners, mostInput, all);
+        if (rank != 0)
+            expectFinished(e, owned[r], to);
+        else // the display rank
             e.poolBytes += blockOf(bytesPerOutput * layout.width() * layout.height());
-        }
-        for (const auto& [other, count] : to) {
-            const std::int64_t requests = count.bytes > allowance ? count.messages : 0;
-            const std::int64_t answers = requests + std::min(count.messages, 2 * count.bytes / allowance);
-            e.mostCredits += requests;
-            e.mostCreditsIn += answers;
-            e.asksForCredit = e.asksForCredit || requests > 0;
-            at(other).mostCredits += answers;
-            at(other).mostCreditsIn += requests;
-        }
-        for (int bit = 1; bit < ranks && !(rank & bit); bit <<= 1) // those below it in the tree
-            if (rank + bit < ranks) {
-                e.verdict.add(verdictBytes);
-                e.consensus.add(consensusBytes);
-                e.poolBytes += blockOf(agreementBytes);
-            }
+        expectCredit(rank, to, messagePoolBytes / 2 / (ranks - 1), all);
+        expectReductions(e, rank, ranks);
         e.poolBytes += blockOf(mostInput) + (64 << 10); // and what is small, in blocks
     }
     for (Expected& e : all)
@@ -522,86 +561,103 @@ private:
         check(c.poolBytes <= e.poolBytes, ranks, "bytes of the pool", c.poolBytes, e.poolBytes);
     }
 
+    bench::Result resultOf(const std::string& system, const std::string& config, const std::string& scene,
+                           int ranks) const
+    {
+        bench::Result r;
+        r.bench = "scaling";
+        r.system = system;
+        r.config = config;
+        r.scene = scene;
+        r.ranks = ranks;
+        r.width = o_.width, r.height = o_.height;
+        r.commit = o_.commit;
+        return r;
+    }
+
+    // Of all ranks in the last frame.
+    struct Sums {
+        MessageCount all, formula, credits;
+        std::int64_t mostCredits = 0;
+    };
+
+    Sums checkAll(int ranks, const Measured& m, const std::vector<Expected>& expected)
+    {
+        Sums sums;
+        for (std::size_t r = 0; r < expected.size(); ++r) {
+            checkCounts(ranks, m.first[r], expected[r], true);
+            checkCounts(ranks, m.last[r], expected[r], false);
+            sums.all += m.last[r].all;
+            sums.credits += m.last[r].credits;
+            Expected e = expected[r];
+            e.finished = m.last[r].finished; // of which there is but a bound
+            sums.formula += e.everyFrame();
+            sums.mostCredits += expected[r].mostCredits;
+        }
+        // The report of a frame has what was sent before each rank entered the verdict: not the messages of that.
+        const std::int64_t unreported = sums.all.messages - 2 * (ranks - 1) - m.report.messagesSent;
+        check(unreported >= 0 && unreported <= sums.credits.messages, ranks, "messages that no report has", unreported,
+              0);
+        return sums;
+    }
+
     void count(const std::string& sceneName)
     {
         bench::Table sent({"ranks", "tiles", "active pixels", "messages", "most", "kB", "most", "off the formulas [%]",
                            "credit, all ranks", "at most", "new bricks: messages", "most", "memory [MB]", "most",
                            "rank 0 takes", "ms"});
-        for (const int ranks : o_.ranks) {
-            const auto scene = sceneOf(sceneName, ranks, o_.width, o_.height);
-            const dfb::TileLayout layout(o_.width, o_.height, tileSize);
-            std::vector<bench::PartialImage> images(static_cast<std::size_t>(ranks));
-            std::vector<std::vector<Input>> inputs;
-            for (int rank = 0; rank < ranks; ++rank) {
-                bench::PartialImage& image = images[static_cast<std::size_t>(rank)];
-                scene->renderPart(rank, tileSize, image);
-                inputs.push_back(inputsOf(image, layout));
-            }
-            const std::vector<Expected> expected =
-                expectedOf(inputs, layout, dfb::FrameBufferConfig().messages.poolBytes);
-            const Measured m =
-                measure(images, o_.width, o_.height, std::max(2, o_.frames), std::exchange(o_.trace, {}));
-            MessageCount all, formula, credits;
-            std::int64_t mostCredits = 0;
-            for (std::size_t r = 0; r < images.size(); ++r) {
-                checkCounts(ranks, m.first[r], expected[r], true);
-                checkCounts(ranks, m.last[r], expected[r], false);
-                all += m.last[r].all;
-                credits += m.last[r].credits;
-                Expected e = expected[r];
-                e.finished = m.last[r].finished; // of which there is but a bound
-                formula += e.everyFrame();
-                mostCredits += expected[r].mostCredits;
-            }
-            // The report of a frame has what was sent before each rank entered the verdict: not the messages of that.
-            const std::int64_t unreported = all.messages - 2 * (ranks - 1) - m.report.messagesSent;
-            check(unreported >= 0 && unreported <= credits.messages, ranks, "messages that no report has", unreported,
-                  0);
-            const auto text = [](double v) { return bench::text(v); };
-            const auto whole = [](double v) { return std::to_string(static_cast<std::int64_t>(v)); };
-            const std::size_t n = images.size();
-            const auto tiles = medianAndMost(n, [&](std::size_t r) { return expected[r].tiles; });
-            const auto pixels = medianAndMost(n, [&](std::size_t r) { return expected[r].activePixels; });
-            const auto messages = medianAndMost(n, [&](std::size_t r) { return m.last[r].all.messages; });
-            const auto bytes = medianAndMost(n, [&](std::size_t r) { return m.last[r].all.bytes; });
-            const auto fresh = medianAndMost(n, [&](std::size_t r) { return m.first[r].all.messages; });
-            const auto memory = medianAndMost(n, [&](std::size_t r) { return m.last[r].poolBytes; });
-            const double off =
-                100.0 * static_cast<double>(all.bytes - formula.bytes) / static_cast<double>(formula.bytes);
-            sent.add({std::to_string(ranks), whole(tiles.first), whole(pixels.first), whole(messages.first),
-                      whole(messages.second), text(bytes.first / 1e3), text(bytes.second / 1e3), text(off),
-                      std::to_string(credits.messages), std::to_string(mostCredits), whole(fresh.first),
-                      whole(fresh.second), text(memory.first / 1e6), text(memory.second / 1e6),
-                      std::to_string(m.last[0].received.messages), text(bench::figureOf(m.ms).median)});
-            std::fprintf(stderr, "%s, %d ranks: %.1f ms a frame\n", sceneName.c_str(), ranks,
-                         bench::figureOf(m.ms).median);
-            bench::Result r;
-            r.bench = "scaling";
-            r.system = "dfb";
-            r.config = "counted, a frame";
-            r.scene = sceneName;
-            r.ranks = ranks;
-            r.width = o_.width, r.height = o_.height;
-            r.ms = bench::figureOf(m.ms);
-            r.cpuMs = bench::figureOf(m.cpuMs);
-            r.bytes = static_cast<double>(all.bytes);
-            r.messages = static_cast<double>(all.messages);
-            r.peakMemoryBytes = memory.second;
-            r.commit = o_.commit;
-            char more[512];
-            std::snprintf(more, sizeof more,
-                          R"(, "tiles_median": %.0f, "active_pixels_median": %.0f, "messages_median": %.0f, )"
-                          R"("messages_max": %.0f, "bytes_median": %.0f, "bytes_max": %.0f, "formula_bytes": %lld, )"
-                          R"("credit_messages": %lld, "peak_memory_median": %.0f, "display_messages_in": %lld)",
-                          tiles.first, pixels.first, messages.first, messages.second, bytes.first, bytes.second,
-                          static_cast<long long>(formula.bytes), static_cast<long long>(credits.messages), memory.first,
-                          static_cast<long long>(m.last[0].received.messages));
-            r.more = more;
-            results_.push_back(std::move(r));
+        for (const int ranks : o_.ranks)
+            countOn(ranks, sceneName, sent);
+        print(sent, sceneName + ", " + std::to_string(o_.width) + 'x' + std::to_string(o_.height)
+                        + ": what a rank sends in a frame; the median of the ranks, and the rank with most");
+    }
+
+    void countOn(int ranks, const std::string& sceneName, bench::Table& table)
+    {
+        const auto scene = sceneOf(sceneName, ranks, o_.width, o_.height);
+        const dfb::TileLayout layout(o_.width, o_.height, tileSize);
+        std::vector<bench::PartialImage> images(static_cast<std::size_t>(ranks));
+        std::vector<std::vector<Input>> inputs;
+        for (int rank = 0; rank < ranks; ++rank) {
+            bench::PartialImage& image = images[static_cast<std::size_t>(rank)];
+            scene->renderPart(rank, tileSize, image);
+            inputs.push_back(inputsOf(image, layout));
         }
-        const std::string title = sceneName + ", " + std::to_string(o_.width) + 'x' + std::to_string(o_.height)
-                                  + ": what a rank sends in a frame; the median of the ranks, and the rank with most";
-        print(sent, title);
+        const std::vector<Expected> expected = expectedOf(inputs, layout);
+        const Measured m = measure(images, o_.width, o_.height, std::max(2, o_.frames), std::exchange(o_.trace, {}));
+        const auto [all, formula, credits, mostCredits] = checkAll(ranks, m, expected);
+        const auto text = [](double v) { return bench::text(v); };
+        const auto whole = [](double v) { return std::to_string(static_cast<std::int64_t>(v)); };
+        const std::size_t n = images.size();
+        const auto tiles = medianAndMost(n, [&](std::size_t r) { return expected[r].tiles; });
+        const auto pixels = medianAndMost(n, [&](std::size_t r) { return expected[r].activePixels; });
+        const auto messages = medianAndMost(n, [&](std::size_t r) { return m.last[r].all.messages; });
+        const auto bytes = medianAndMost(n, [&](std::size_t r) { return m.last[r].all.bytes; });
+        const auto fresh = medianAndMost(n, [&](std::size_t r) { return m.first[r].all.messages; });
+        const auto memory = medianAndMost(n, [&](std::size_t r) { return m.last[r].poolBytes; });
+        const double off = 100.0 * static_cast<double>(all.bytes - formula.bytes) / static_cast<double>(formula.bytes);
+        bench::Result r = resultOf("dfb", "counted, a frame", sceneName, ranks);
+        r.ms = bench::figureOf(m.ms);
+        r.cpuMs = bench::figureOf(m.cpuMs);
+        r.bytes = static_cast<double>(all.bytes);
+        r.messages = static_cast<double>(all.messages);
+        r.peakMemoryBytes = memory.second;
+        char more[512];
+        std::snprintf(more, sizeof more,
+                      R"(, "tiles_median": %.0f, "active_pixels_median": %.0f, "messages_median": %.0f, )"
+                      R"("messages_max": %.0f, "bytes_median": %.0f, "bytes_max": %.0f, "formula_bytes": %lld, )"
+                      R"("credit_messages": %lld, "peak_memory_median": %.0f, "display_messages_in": %lld)",
+                      tiles.first, pixels.first, messages.first, messages.second, bytes.first, bytes.second,
+                      static_cast<long long>(formula.bytes), static_cast<long long>(credits.messages), memory.first,
+                      static_cast<long long>(m.last[0].received.messages));
+        r.more = more;
+        table.add({std::to_string(ranks), whole(tiles.first), whole(pixels.first), whole(messages.first),
+                   whole(messages.second), text(bytes.first / 1e3), text(bytes.second / 1e3), text(off),
+                   std::to_string(credits.messages), std::to_string(mostCredits), whole(fresh.first),
+                   whole(fresh.second), text(memory.first / 1e6), text(memory.second / 1e6),
+                   std::to_string(m.last[0].received.messages), text(r.ms.median)});
+        std::fprintf(stderr, "%s, %d ranks: %.1f ms a frame\n", sceneName.c_str(), ranks, r.ms.median);
+        results_.push_back(std::move(r));
     }
 
     void estimate()
@@ -626,8 +682,7 @@ private:
                 inputs.push_back(inputsOf(image, layout));
                 viewports.push_back(image.viewport);
             }
-            const std::vector<Expected> expected =
-                expectedOf(inputs, layout, dfb::FrameBufferConfig().messages.poolBytes);
+            const std::vector<Expected> expected = expectedOf(inputs, layout);
             for (std::size_t n = 0; n < networks.size(); ++n) {
                 std::vector<double> ms{dfbMs(networks[n], expected, o_.costs)};
                 for (const int most : {2, 4, 8})
@@ -636,16 +691,8 @@ private:
                 for (std::size_t s = 0; s < systems.size(); ++s) {
                     row.push_back(bench::text(ms[s]));
                     lines[n * systems.size() + s].points.emplace_back(ranks, ms[s]);
-                    bench::Result r;
-                    r.bench = "scaling";
-                    r.system = systems[s];
-                    r.config = "LogGP, " + networks[n].name;
-                    r.scene = "bricks";
-                    r.ranks = ranks;
-                    r.width = o_.width, r.height = o_.height;
-                    r.ms.median = ms[s];
-                    r.commit = o_.commit;
-                    results_.push_back(std::move(r));
+                    results_.push_back(resultOf(systems[s], "LogGP, " + networks[n].name, "bricks", ranks));
+                    results_.back().ms.median = ms[s];
                 }
                 tables[n].add(std::move(row));
             }
