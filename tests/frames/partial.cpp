@@ -139,13 +139,8 @@ struct PartialFrames {
                     }
                 for (int index = 0; index < fb.layout().tileCount(); ++index)
                     for (const dfb::Brick& b : mine)
-                        if (index != lost && scene::meets(fb, b, index)) {
-                            open.start(*tile, index);
-                            tile->generation = 1;
-                            tile->source = b.id;
-                            renderBrick(s, b, *tile);
-                            open.setTile(*tile);
-                        }
+                        if (index != lost && scene::meets(fb, b, index))
+                            scene::sendInput(open, *tile, s, b, index);
                 fails(open.end(), dfb::ErrorKind::TimedOut, "tile " + std::to_string(lost), one, false,
                       "a missing input");
             }

@@ -162,6 +162,26 @@ struct PassesInTurn {
     }
 };
 
+// Says how many inputs will come for a tile of an open frame. `tile`: memory for it, here and below.
+template <class Frame, class Tile>
+void sendParent(Frame& frame, Tile& tile, int index, int inputs, int pass = 0)
+{
+    frame.start(tile, index, pass);
+    tile.children = inputs;
+    frame.setTile(tile);
+}
+
+// Renders a brick's input for a tile of an open frame, and sends it.
+template <class Frame, class Tile>
+void sendInput(Frame& frame, Tile& tile, const Scene& s, const dfb::Brick& brick, int index, int pass = 0)
+{
+    frame.start(tile, index, pass);
+    tile.generation = 1;
+    tile.source = brick.id;
+    renderBrick(s, brick, tile);
+    frame.setTile(tile);
+}
+
 // Listing 3 of the paper.
 template <class FrameBuffer>
 dfb::FrameReport listing3(FrameBuffer& fb, const Scene& s, const std::vector<dfb::Brick>& mine)
@@ -170,20 +190,14 @@ dfb::FrameReport listing3(FrameBuffer& fb, const Scene& s, const std::vector<dfb
     const auto tile = std::make_unique<typename FrameBuffer::Tile>();
     for (int pass = 0; pass < s.passes; ++pass) {
         for (int index : frame.ownedTiles()) {
-            frame.start(*tile, index, pass);
-            tile->children = static_cast<int>(std::count_if(s.bricks.begin(), s.bricks.end(),
-                                                            [&](const dfb::Brick& b) { return meets(fb, b, index); }));
-            frame.setTile(*tile);
+            const auto inputs = std::count_if(s.bricks.begin(), s.bricks.end(),
+                                              [&](const dfb::Brick& b) { return meets(fb, b, index); });
+            sendParent(frame, *tile, index, static_cast<int>(inputs), pass);
         }
         for (int index = 0; index < fb.layout().tileCount(); ++index)
             for (const dfb::Brick& brick : mine)
-                if (meets(fb, brick, index)) {
-                    frame.start(*tile, index, pass);
-                    tile->generation = 1;
-                    tile->source = brick.id;
-                    renderBrick(s, brick, *tile);
-                    frame.setTile(*tile);
-                }
+                if (meets(fb, brick, index))
+                    sendInput(frame, *tile, s, brick, index, pass);
     }
     return frame.end();
 }

@@ -21,13 +21,8 @@ void sendAll(FrameBuffer& fb, Frame& frame, const scene::Scene& s, bool second)
             frame.setTile(*tile);
         }
         for (const dfb::Brick& b : mine)
-            if (scene::meets(fb, b, index)) {
-                frame.start(*tile, index);
-                tile->generation = 1;
-                tile->source = b.id;
-                renderBrick(s, b, *tile);
-                frame.setTile(*tile);
-            }
+            if (scene::meets(fb, b, index))
+                scene::sendInput(frame, *tile, s, b, index);
     }
 }
 

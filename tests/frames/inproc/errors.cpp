@@ -303,22 +303,14 @@ TEST_CASE("A tile that cannot be right is refused at once, and nothing is sent",
             over.set_value();
             // None of these calls has harmed the frame.
             for (int index = 0; index < 28; ++index)
-                for (const dfb::Brick& brick : s.bricks) {
-                    frame.start(*tile, index);
-                    tile->generation = 1;
-                    tile->source = brick.id;
-                    scene::renderBrick(s, brick, *tile);
-                    frame.setTile(*tile);
-                }
+                for (const dfb::Brick& brick : s.bricks)
+                    scene::sendInput(frame, *tile, s, brick, index);
             frame.end();
         } else {
             auto frame = fb.begin(scene::paramsOf(s));
             auto tile = std::make_unique<Fb::Tile>();
-            for (int index = 0; index < 28; ++index) {
-                frame.start(*tile, index);
-                tile->children = 4;
-                frame.setTile(*tile);
-            }
+            for (int index = 0; index < 28; ++index)
+                scene::sendParent(frame, *tile, index, 4);
             const auto report = frame.end();
             wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
         }
@@ -494,11 +486,7 @@ TEST_CASE("declare() at a wrong time or of what is not there is refused, and not
                 const auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
                 for (const dfb::BrickInTile& pair : pairs) {
                     const dfb::Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)];
-                    frame.start(*tile, pair.tile);
-                    tile->generation = 1;
-                    tile->source = brick.id;
-                    renderBrick(s, brick, *tile);
-                    frame.setTile(*tile);
+                    scene::sendInput(frame, *tile, s, brick, pair.tile);
                 }
                 mine.push_back(outcomeOf([&] { frame.declare(inputs); }));
                 const auto report = frame.end();

@@ -384,11 +384,8 @@ TEST_CASE("Two framebuffers at once on one communicator", "[images]")
             auto frame = fbA.begin(scene::paramsOf(a));
             const auto reportB = scene::renderLoop(fbB, b, Loop::ImageOwned);
             auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
-            for (int index : fbA.ownedTiles()) {
-                frame.start(*tile, index);
-                tile->children = static_cast<int>(a.bricks.size());
-                frame.setTile(*tile);
-            }
+            for (int index : fbA.ownedTiles())
+                scene::sendParent(frame, *tile, index, static_cast<int>(a.bricks.size()));
             for (int index = 0; index < fbA.layout().tileCount(); ++index)
                 for (const dfb::Brick& brick : scene::bricksOf(a, communicator.rank(), 3)) {
                     frame.start(*tile, index);

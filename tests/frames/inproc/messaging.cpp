@@ -80,21 +80,13 @@ bool interleaved(A& a, B& b, const Scene& sa, const Scene& sb, bool endFirst, bo
         auto frameB = b.begin(scene::paramsOf(sb));
         const auto tileA = std::make_unique<typename A::Tile>();
         const auto tileB = std::make_unique<typename B::Tile>();
-        for (int index : a.ownedTiles()) {
-            frameA.start(*tileA, index);
-            tileA->children = static_cast<int>(sa.bricks.size());
-            frameA.setTile(*tileA);
-        }
+        for (int index : a.ownedTiles())
+            scene::sendParent(frameA, *tileA, index, static_cast<int>(sa.bricks.size()));
         const auto mine = scene::bricksOf(sa, a.rank(), a.size());
         for (int index = 0; index < std::max(a.layout().tileCount(), b.layout().tileCount()); ++index) {
             if (index < a.layout().tileCount())
-                for (const dfb::Brick& brick : mine) {
-                    frameA.start(*tileA, index);
-                    tileA->generation = 1;
-                    tileA->source = brick.id;
-                    scene::renderBrick(sa, brick, *tileA);
-                    frameA.setTile(*tileA);
-                }
+                for (const dfb::Brick& brick : mine)
+                    scene::sendInput(frameA, *tileA, sa, brick, index);
             if (index < b.layout().tileCount() && (index + 1) % b.size() == b.rank()) {
                 frameB.start(*tileB, index);
                 scene::renderBrick(sb, sb.bricks.front(), *tileB);
@@ -224,20 +216,12 @@ TEST_CASE("One framebuffer goes while the other has a frame open; another is mad
             b.reset();
             b = std::make_unique<FrameBuffer<Single>>(connection, configOf(s));
             const auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
-            for (int index : a.ownedTiles()) {
-                frame.start(*tile, index);
-                tile->children = static_cast<int>(s.bricks.size());
-                frame.setTile(*tile);
-            }
+            for (int index : a.ownedTiles())
+                scene::sendParent(frame, *tile, index, static_cast<int>(s.bricks.size()));
             scene::renderLoop(*b, sceneFor(Loop::ImageOwned), Loop::ImageOwned);
             for (const dfb::Brick& brick : scene::bricksOf(s, a.rank(), a.size()))
-                for (int index = 0; index < a.layout().tileCount(); ++index) {
-                    frame.start(*tile, index);
-                    tile->generation = 1;
-                    tile->source = brick.id;
-                    scene::renderBrick(s, brick, *tile);
-                    frame.setTile(*tile);
-                }
+                for (int index = 0; index < a.layout().tileCount(); ++index)
+                    scene::sendInput(frame, *tile, s, brick, index);
             const auto report = frame.end();
             if (a.isDisplayRank())
                 wrong = scene::wrongValues(Picture(a.image(), report), scene::referenceOf(s));
@@ -315,11 +299,8 @@ TEST_CASE("Repeated messages are counted exactly, and a frame without any has no
                 setAll.set_value(); // all repeated messages have come
             if (fb.rank() == 0 && round == 0)
                 setAll.get_future().wait_for(std::chrono::seconds(20));
-            for (int index : fb.ownedTiles()) {
-                frame.start(*tile, index);
-                tile->children = 2;
-                frame.setTile(*tile);
-            }
+            for (int index : fb.ownedTiles())
+                scene::sendParent(frame, *tile, index, 2);
             const auto report = frame.end();
             if (fb.rank() == 0)
                 repeated.push_back(report.repeatedMessages);
@@ -1082,13 +1063,8 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
                     if (fb.rank() == 1) { // after rank 0's begin(), which moves messages
                         begun.get_future().wait_for(std::chrono::seconds(20));
                         for (const dfb::Brick& brick : s.bricks)
-                            for (int index = 0; index < 28; ++index) {
-                                frame.start(*tile, index);
-                                tile->generation = 1;
-                                tile->source = brick.id;
-                                scene::renderBrick(s, brick, *tile);
-                                frame.setTile(*tile);
-                            }
+                            for (int index = 0; index < 28; ++index)
+                                scene::sendInput(frame, *tile, s, brick, index);
                         sent.set_value();
                     } else {
                         begun.set_value();
@@ -1101,11 +1077,8 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
                         while (inputsAdded < 28 * 6 && std::chrono::steady_clock::now() < limit)
                             moved = fb.poll() || moved;
                         after = inputsAdded;
-                        for (int index : fb.ownedTiles()) {
-                            frame.start(*tile, index);
-                            tile->children = 6;
-                            frame.setTile(*tile);
-                        }
+                        for (int index : fb.ownedTiles())
+                            scene::sendParent(frame, *tile, index, 6);
                     }
                     const auto report = frame.end();
                     if (fb.isDisplayRank())

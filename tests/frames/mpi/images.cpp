@@ -181,20 +181,12 @@ TEST_CASE("A part of the ranks, and two framebuffers on different communicators 
         for (int i = 0; i < 2; ++i) {
             auto frame = fbAll.begin(scene::paramsOf(all));
             const auto tile = std::make_unique<decltype(fbAll)::Tile>();
-            for (int index : fbAll.ownedTiles()) {
-                frame.start(*tile, index);
-                tile->children = static_cast<int>(all.bricks.size());
-                frame.setTile(*tile);
-            }
+            for (int index : fbAll.ownedTiles())
+                scene::sendParent(frame, *tile, index, static_cast<int>(all.bricks.size()));
             const auto reportPart = scene::renderLoop(fbPart, part, Loop::ImageOwned);
             for (const dfb::Brick& brick : scene::bricksOf(all, fbAll.rank(), fbAll.size()))
-                for (int index = 0; index < fbAll.layout().tileCount(); ++index) {
-                    frame.start(*tile, index);
-                    tile->generation = 1;
-                    tile->source = brick.id;
-                    scene::renderBrick(all, brick, *tile);
-                    frame.setTile(*tile);
-                }
+                for (int index = 0; index < fbAll.layout().tileCount(); ++index)
+                    scene::sendInput(frame, *tile, all, brick, index);
             const auto reportAll = frame.end();
             if (fbAll.isDisplayRank())
                 CHECK(scene::wrongValues(Picture(fbAll.image(), reportAll), scene::referenceOf(all)) == 0);

@@ -211,11 +211,8 @@ TEST_CASE("Two framebuffers on one connection, and one with its own, with frames
     for (int i = 0; i < 3; ++i) {
         auto frame = a->begin(scene::paramsOf(s));
         const auto tile = std::make_unique<Fb::Tile>();
-        for (int index : a->ownedTiles()) {
-            frame.start(*tile, index);
-            tile->children = 6;
-            frame.setTile(*tile);
-        }
+        for (int index : a->ownedTiles())
+            scene::sendParent(frame, *tile, index, 6);
         CHECK(goodFrame(*b, t));
         {
             auto broken = c->begin(scene::paramsOf(s));
@@ -225,13 +222,8 @@ TEST_CASE("Two framebuffers on one connection, and one with its own, with frames
             CHECK(has(text, "C broke"));
         }
         for (const dfb::Brick& brick : scene::bricksOf(s, a->rank(), a->size()))
-            for (int index = 0; index < a->layout().tileCount(); ++index) {
-                frame.start(*tile, index);
-                tile->generation = 1;
-                tile->source = brick.id;
-                scene::renderBrick(s, brick, *tile);
-                frame.setTile(*tile);
-            }
+            for (int index = 0; index < a->layout().tileCount(); ++index)
+                scene::sendInput(frame, *tile, s, brick, index);
         const auto report = frame.end();
         if (a->isDisplayRank())
             CHECK(scene::wrongValues(Picture(a->image(), report), scene::referenceOf(s)) == 0);
@@ -362,11 +354,8 @@ TEST_CASE("What is missing when the time is up is named on every rank, and the n
                     frame.declare(fb.rank() == last ? std::vector<dfb::TileInput>{{5, 77, 3}}
                                                     : std::vector<dfb::TileInput>());
                 else
-                    for (int index : fb.ownedTiles()) {
-                        frame.start(*tile, index);
-                        tile->children = index == 5 ? 2 : 0;
-                        frame.setTile(*tile);
-                    }
+                    for (int index : fb.ownedTiles())
+                        scene::sendParent(frame, *tile, index, index == 5 ? 2 : 0);
                 frame.end();
             });
             return std::pair(missing, outcomeOfGoodFrame(fb, s));
@@ -438,13 +427,8 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
         const auto tile = std::make_unique<decltype(fb)::Tile>();
         if (rank > 0)
             for (const dfb::Brick& brick : scene::bricksOf(s, rank, size))
-                for (int index = 0; index < 28; ++index) {
-                    frame.start(*tile, index);
-                    tile->generation = 1;
-                    tile->source = brick.id;
-                    scene::renderBrick(s, brick, *tile);
-                    frame.setTile(*tile);
-                }
+                for (int index = 0; index < 28; ++index)
+                    scene::sendInput(frame, *tile, s, brick, index);
         MPI_Barrier(MPI_COMM_WORLD); // all inputs were sent
         if (rank == 0) {
             CHECK(inputs == 0); // it has not polled
@@ -456,18 +440,10 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
                 fb.poll();
             CHECK(inputs == expected);
             for (const dfb::Brick& brick : scene::bricksOf(s, rank, size))
-                for (int index = 0; index < 28; ++index) {
-                    frame.start(*tile, index);
-                    tile->generation = 1;
-                    tile->source = brick.id;
-                    scene::renderBrick(s, brick, *tile);
-                    frame.setTile(*tile);
-                }
-            for (int index : fb.ownedTiles()) {
-                frame.start(*tile, index);
-                tile->children = 6;
-                frame.setTile(*tile);
-            }
+                for (int index = 0; index < 28; ++index)
+                    scene::sendInput(frame, *tile, s, brick, index);
+            for (int index : fb.ownedTiles())
+                scene::sendParent(frame, *tile, index, 6);
         }
         const auto report = frame.end();
         if (fb.isDisplayRank())
