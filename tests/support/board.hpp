@@ -196,4 +196,9 @@ inline std::string joined(const std::vector<std::string>& texts)
     return all;
 }
 
+inline bool allSame(const std::vector<std::string>& texts)
+{
+    return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
+}
+
 } // namespace board

@@ -34,6 +34,8 @@ namespace errors_cases {
 
 namespace {
 
+using board::allSame;
+using board::joined;
 using scene::has;
 using scene::Loop;
 using scene::outcomeOf;
@@ -97,19 +99,6 @@ template <class TileOp, class PixelOp = dfb::NoPixelOp>
 using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, dfb::InprocTransport>;
 template <class TileOp>
 using InspectedFrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, InspectedTransport>;
-
-bool allSame(const std::vector<std::string>& texts)
-{
-    return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
-}
-
-std::string joined(const std::vector<std::string>& texts)
-{
-    std::string all;
-    for (const std::string& t : texts)
-        all += "\n  " + t;
-    return all;
-}
 
 // The errors of each rank in a bad frame, and the number of wrong values in the good frame after it.
 struct BadFrame {

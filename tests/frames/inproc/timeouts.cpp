@@ -26,6 +26,7 @@ namespace timeouts_cases {
 
 namespace {
 
+using board::allSame;
 using board::Board;
 using board::BoardTransport;
 using board::eachAtOnce;
@@ -43,11 +44,6 @@ using Clock = std::chrono::steady_clock;
 
 using Blend = dfb::BasicAlphaBlend<16>;
 using FrameBuffer = dfb::DistributedFrameBuffer<Blend, dfb::NoPixelOp, BoardTransport>;
-
-bool allSame(const std::vector<std::string>& texts)
-{
-    return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
-}
 
 // The outcome of a frame on a rank: its error, or none.
 struct Ending {

@@ -23,6 +23,7 @@ namespace wire_safety_cases {
 
 namespace {
 
+using board::allSame;
 using board::Board;
 using board::BoardTransport;
 using board::joined;
@@ -49,11 +50,6 @@ void put(dfb::Buffer& message, std::size_t at, const T& value)
     if (message.size() < at + sizeof value)
         throw std::logic_error("the message is too short for the test");
     std::memcpy(message.data() + at, &value, sizeof value);
-}
-
-bool allSame(const std::vector<std::string>& texts)
-{
-    return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
 }
 
 // The errors of 4 ranks that make a framebuffer, rank 3 with another operation than the others.
