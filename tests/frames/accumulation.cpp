@@ -85,12 +85,8 @@ dfb::FrameReport render(FrameBuffer& fb, Loop loop, const scene::Scene& s, const
         if (isDeclared)
             frame.declare(dfb::inputsOf(world, pairs));
         for (const int index : fb.ownedTiles())
-            for (int pass = 0; !isDeclared && pass < params.passes; ++pass) {
-                frame.start(*tile, index, pass);
-                for (const dfb::Brick& b : s.bricks)
-                    tile->children += scene::meets(fb, b, index);
-                frame.setTile(*tile);
-            }
+            for (int pass = 0; !isDeclared && pass < params.passes; ++pass)
+                scene::sendParent(frame, *tile, index, scene::bricksIn(fb, s, index), pass);
         try {
             for (const dfb::BrickInTile& pair : pairs)
                 for (int pass = 0; pass < params.passes; ++pass) {

@@ -504,10 +504,7 @@ private:
         std::vector<Input> inputs;
         for (int tile = 0; tile < fb_.layout().tileCount(); ++tile) {
             if (fb_.tileOwner(tile) == fb_.rank())
-                inputs.push_back(
-                    {tile, nullptr,
-                     static_cast<int>(std::count_if(s.bricks.begin(), s.bricks.end(),
-                                                    [&](const dfb::Brick& b) { return scene::meets(fb_, b, tile); }))});
+                inputs.push_back({tile, nullptr, scene::bricksIn(fb_, s, tile)});
             for (const dfb::Brick& b : mine_)
                 if (scene::meets(fb_, b, tile))
                     inputs.push_back({tile, &b, 0});
@@ -654,8 +651,7 @@ private:
         if (fault.kind == Process && ending.error->tile < 0) { // it was about the background
             about.clear();
             for (int tile = 0; tile < fb_.layout().tileCount(); ++tile)
-                if (std::none_of(good_.bricks.begin(), good_.bricks.end(),
-                                 [&](const dfb::Brick& b) { return scene::meets(fb_, b, tile); }))
+                if (scene::bricksIn(fb_, good_, tile) == 0)
                     about.insert(tile);
         }
         if (fault.kind == NewFrame || fault.kind == Add || fault.kind == Finish || fault.kind == Process

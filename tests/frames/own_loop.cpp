@@ -29,8 +29,7 @@ struct OwnLoop {
         const auto render = [&](dfb::FrameConfig params, const auto& check) {
             auto frame = fb.begin(params);
             frame.forEachTile(fb.ownedTiles(), [&](auto& tile) {
-                for (const dfb::Brick& brick : s.bricks)
-                    tile.children += scene::meets(fb, brick, tile.tile);
+                tile.children = scene::bricksIn(fb, s, tile.tile);
                 frame.setTile(tile);
             });
             std::vector<dfb::BrickInTile> jobs;

@@ -131,12 +131,8 @@ struct PartialFrames {
                     open.setTile(*tile);
                 }
                 for (int index = 0; index < fb.layout().tileCount(); ++index)
-                    if (index != lost && fb.tileOwner(index) == fb.rank()) {
-                        open.start(*tile, index);
-                        for (const dfb::Brick& b : s.bricks)
-                            tile->children += scene::meets(fb, b, index);
-                        open.setTile(*tile);
-                    }
+                    if (index != lost && fb.tileOwner(index) == fb.rank())
+                        scene::sendParent(open, *tile, index, scene::bricksIn(fb, s, index));
                 for (int index = 0; index < fb.layout().tileCount(); ++index)
                     for (const dfb::Brick& b : mine)
                         if (index != lost && scene::meets(fb, b, index))

@@ -162,6 +162,14 @@ struct PassesInTurn {
     }
 };
 
+// The number of bricks that may have pixels of a tile.
+template <class FrameBuffer>
+int bricksIn(const FrameBuffer& fb, const Scene& s, int tile)
+{
+    return static_cast<int>(std::count_if(s.bricks.begin(), s.bricks.end(),
+                                          [&](const dfb::Brick& brick) { return meets(fb, brick, tile); }));
+}
+
 // Says how many inputs will come for a tile of an open frame. `tile`: memory for it, here and below.
 template <class Frame, class Tile>
 void sendParent(Frame& frame, Tile& tile, int index, int inputs, int pass = 0)
@@ -189,11 +197,8 @@ dfb::FrameReport listing3(FrameBuffer& fb, const Scene& s, const std::vector<dfb
     auto frame = fb.begin(paramsOf(s));
     const auto tile = std::make_unique<typename FrameBuffer::Tile>();
     for (int pass = 0; pass < s.passes; ++pass) {
-        for (int index : frame.ownedTiles()) {
-            const auto inputs = std::count_if(s.bricks.begin(), s.bricks.end(),
-                                              [&](const dfb::Brick& b) { return meets(fb, b, index); });
-            sendParent(frame, *tile, index, static_cast<int>(inputs), pass);
-        }
+        for (int index : frame.ownedTiles())
+            sendParent(frame, *tile, index, bricksIn(fb, s, index), pass);
         for (int index = 0; index < fb.layout().tileCount(); ++index)
             for (const dfb::Brick& brick : mine)
                 if (meets(fb, brick, index))

@@ -14,12 +14,8 @@ void sendAll(FrameBuffer& fb, Frame& frame, const scene::Scene& s, bool second)
     const auto mine = bricksOf(s, fb.rank(), fb.size());
     const auto tile = std::make_unique<typename FrameBuffer::Tile>();
     for (int index = second ? 1 : 0; index < fb.layout().tileCount(); index += 2) { // even or odd tiles
-        if (fb.tileOwner(index) == fb.rank()) {
-            frame.start(*tile, index);
-            for (const dfb::Brick& b : s.bricks)
-                tile->children += scene::meets(fb, b, index);
-            frame.setTile(*tile);
-        }
+        if (fb.tileOwner(index) == fb.rank())
+            scene::sendParent(frame, *tile, index, scene::bricksIn(fb, s, index));
         for (const dfb::Brick& b : mine)
             if (scene::meets(fb, b, index))
                 scene::sendInput(frame, *tile, s, b, index);

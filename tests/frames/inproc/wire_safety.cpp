@@ -6,7 +6,6 @@
 
 #include <dfb/wire/fragment_message.hpp>
 
-#include <algorithm>
 #include <atomic>
 #include <cstdint>
 #include <cstring>
