@@ -154,6 +154,15 @@ enum class Loop {
 
 inline bool isDataParallel(Loop loop) { return loop == Loop::Listing3 || loop == Loop::Declared; }
 
+// As makeScene(); if the loop is not data-parallel, the scene has one brick, which fills the image.
+inline Scene makeSceneFor(Loop loop, int bricks, std::uint64_t seed, int width = 97, int height = 61, int passes = 1)
+{
+    Scene s = makeScene(isDataParallel(loop) ? bricks : 1, seed, width, height, passes);
+    if (!isDataParallel(loop))
+        s.bricks[0].bounds = {{0, 0, 0}, {static_cast<float>(width), static_cast<float>(height), 1}};
+    return s;
+}
+
 // A tile-brick owner: deals the tiles of a brick, and their passes, in turn to the ranks that hold it.
 struct PassesInTurn {
     int operator()(const dfb::SharedBrick& brick, int tile, int pass) const

@@ -65,13 +65,8 @@ std::size_t blockBytes(std::size_t bytes) // as MemoryPool rounds up
 
 // Bytes of the message of a full tile of Adder.
 constexpr std::size_t fullMessage = dfb::detail::fragmentPrefix + 16 * Adder::tileSize * Adder::tileSize;
-Scene sceneFor(Loop loop, std::uint64_t seed = 1)
-{
-    Scene s = scene::makeScene(scene::isDataParallel(loop) ? 6 : 1, seed);
-    if (!scene::isDataParallel(loop))
-        s.bricks[0].bounds = {{0, 0, 0}, {97, 61, 1}};
-    return s;
-}
+
+Scene sceneFor(Loop loop, std::uint64_t seed = 1) { return scene::makeSceneFor(loop, 6, seed); }
 
 } // namespace
 

@@ -95,10 +95,7 @@ Picture pictureOf(const Scene& s, const Options& o)
 
 Scene sceneFor(Loop loop, std::uint64_t seed = 1, int passes = 1)
 {
-    Scene s = scene::makeScene(scene::isDataParallel(loop) ? 9 : 1, seed, 97, 61, passes);
-    if (!scene::isDataParallel(loop))
-        s.bricks[0].bounds = {{0, 0, 0}, {97, 61, 1}};
-    return s;
+    return scene::makeSceneFor(loop, 9, seed, 97, 61, passes);
 }
 
 constexpr Loop allLoops[] = {Loop::Listing3, Loop::Declared, Loop::ImageOwned, Loop::ImageDealt};

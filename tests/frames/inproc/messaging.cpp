@@ -55,13 +55,7 @@ using AddingFrameBuffer = dfb::DistributedFrameBuffer<flood::Adder, dfb::NoPixel
 using Blend = dfb::BasicAlphaBlend<16>;
 using Single = dfb::BasicImageParallel<16>;
 
-Scene sceneFor(Loop loop, std::uint64_t seed = 1)
-{
-    Scene s = scene::makeScene(scene::isDataParallel(loop) ? 6 : 1, seed);
-    if (!scene::isDataParallel(loop))
-        s.bricks[0].bounds = {{0, 0, 0}, {97, 61, 1}};
-    return s;
-}
+Scene sceneFor(Loop loop, std::uint64_t seed = 1) { return scene::makeSceneFor(loop, 6, seed); }
 
 } // namespace
 

@@ -63,10 +63,7 @@ Picture inProcess(int ranks, const Scene& s, Loop loop, const dfb::FrameBufferCo
 
 Scene sceneFor(Loop loop, std::uint64_t seed = 1, int passes = 1)
 {
-    Scene s = scene::makeScene(scene::isDataParallel(loop) ? 9 : 1, seed, 97, 61, passes);
-    if (!scene::isDataParallel(loop))
-        s.bricks[0].bounds = {{0, 0, 0}, {97, 61, 1}};
-    return s;
+    return scene::makeSceneFor(loop, 9, seed, 97, 61, passes);
 }
 
 } // namespace
