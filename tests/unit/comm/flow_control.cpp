@@ -362,6 +362,19 @@ std::string wrongAtRest(Network& network, std::size_t pool)
     return {};
 }
 
+// As wrongAtRest(), after a case in which `count` messages were sent, none was lost and no epoch failed.
+std::string wrongWithoutLoss(Network& network, const Case& c, std::int64_t count, std::uint64_t seed)
+{
+    std::string wrong;
+    if (network.consumed != count)
+        wrong = "only " + std::to_string(network.consumed) + " of " + std::to_string(count) + " messages arrived";
+    else if (network.mostOutstanding() > c.pool)
+        wrong = std::to_string(network.mostOutstanding()) + " bytes on the way or in the inbox";
+    else
+        wrong = wrongAtRest(network, c.pool);
+    return wrong.empty() ? wrong : wrong + ", " + describe(c, seed);
+}
+
 struct Link {
     std::vector<std::size_t> transmitted;
     std::vector<FlowControl::Request> requests;
@@ -392,14 +405,7 @@ TEST_CASE("Whatever the order of delivery and consumption, all arrives and no po
         const std::int64_t count = planFor(network, c, seed);
         network.run();
         asked += network.requestsSent;
-        if (network.consumed != count)
-            wrong = "only " + std::to_string(network.consumed) + " of " + std::to_string(count) + " messages arrived";
-        else if (network.mostOutstanding() > c.pool)
-            wrong = std::to_string(network.mostOutstanding()) + " bytes on the way or in the inbox";
-        else
-            wrong = wrongAtRest(network, c.pool);
-        if (!wrong.empty())
-            wrong += ", " + describe(c, seed);
+        wrong = wrongWithoutLoss(network, c, count, seed);
     }
     CHECK(wrong.empty());
     if (!wrong.empty())
@@ -455,14 +461,7 @@ TEST_CASE("Epochs that end well follow each other, begun by each rank at its own
             }
             network.run();
         }
-        if (network.consumed != count)
-            wrong = "only " + std::to_string(network.consumed) + " of " + std::to_string(count) + " messages arrived";
-        else if (network.mostOutstanding() > c.pool)
-            wrong = std::to_string(network.mostOutstanding()) + " bytes on the way or in the inbox";
-        else
-            wrong = wrongAtRest(network, c.pool);
-        if (!wrong.empty())
-            wrong += ", " + describe(c, seed);
+        wrong = wrongWithoutLoss(network, c, count, seed);
     }
     INFO(wrong);
     CHECK(wrong.empty());
