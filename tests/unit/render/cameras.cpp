@@ -1,5 +1,6 @@
 // Cameras with lenses, two eyes, domes and motion: no ray meets a box in a tile that the box's projection leaves out.
 #include "catch.hpp"
+#include "random_rays.hpp"
 
 #include <dfb/render/cameras.hpp>
 
@@ -17,31 +18,10 @@ namespace cameras_cases {
 
 namespace {
 
-using Random = std::mt19937_64;
-
-double uniform(Random& random, double low, double high)
-{
-    return low + (high - low) * static_cast<double>(random() >> 11) * 0x1p-53;
-}
-dfb::Vec3 point(Random& random, double extent)
-{
-    return {static_cast<float>(uniform(random, -extent, extent)), static_cast<float>(uniform(random, -extent, extent)),
-            static_cast<float>(uniform(random, -extent, extent))};
-}
-
-bool meets(const dfb::Ray& ray, const dfb::Box3& box)
-{
-    const double o[3] = {ray.origin.x, ray.origin.y, ray.origin.z},
-                 d[3] = {ray.direction.x, ray.direction.y, ray.direction.z};
-    const double lower[3] = {box.lower.x, box.lower.y, box.lower.z}, upper[3] = {box.upper.x, box.upper.y, box.upper.z};
-    double from = 0, to = std::numeric_limits<double>::infinity();
-    for (int a = 0; a < 3; ++a) {
-        const double t0 = (lower[a] - o[a]) / d[a], t1 = (upper[a] - o[a]) / d[a];
-        from = std::max(from, std::min(t0, t1));
-        to = std::min(to, std::max(t0, t1));
-    }
-    return from <= to;
-}
+using rays::meets;
+using rays::point;
+using rays::Random;
+using rays::uniform;
 
 struct Count {
     std::size_t hits = 0, missed = 0, tiles = 0, all = 0;
@@ -71,7 +51,7 @@ Count check(const Camera& camera, std::uint64_t seed)
             const dfb::Ray ray = camera.ray(x, y, width, height, sample);
             if (ray.direction.x == 0 && ray.direction.y == 0 && ray.direction.z == 0)
                 continue;
-            if (!meets(ray, box))
+            if (!meets(ray.origin, ray.direction, box))
                 continue;
             ++count.hits;
             count.missed += found.count(layout.tileAt(static_cast<int>(x) / 8, static_cast<int>(y) / 8)) == 0;
@@ -203,7 +183,8 @@ TEST_CASE("No ray meets a box as small as roundings of the eye in a tile that it
             found.insert(pair.tile);
         for (int i = 0; i < 40; ++i) {
             const double x = uniform(random, 0, 64), y = uniform(random, 0, 48);
-            if (!meets(camera.ray(x, y, 64, 48, {uniform(random, 0, 1), uniform(random, 0, 1), 0}), box))
+            const dfb::Ray ray = camera.ray(x, y, 64, 48, {uniform(random, 0, 1), uniform(random, 0, 1), 0});
+            if (!meets(ray.origin, ray.direction, box))
                 continue;
             ++hits;
             missed += found.count(layout.tileAt(static_cast<int>(x) / 8, static_cast<int>(y) / 8)) == 0;
