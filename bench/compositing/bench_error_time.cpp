@@ -67,6 +67,55 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
         addTiles(systems, connection, inputs, std::string("tiles of ") + side + ", float32", {});
 }
 
+// A disc with a noisy rim and half of it in noisy light before a background without any. It renders a sample of each
+// pixel of a tile, of which each takes 1 us.
+struct NoisyDisc {
+    static constexpr int side = 256; // of the image
+
+    template <class Tile>
+    void operator()(Tile& tile) const
+    {
+        const double until = bench::now() + 1e-6 * tile.region.width() * tile.region.height();
+        tile.forEachPixel([&](int x, int y, float* rgba, float&) {
+            std::uint64_t h =
+                static_cast<std::uint64_t>(y * side + x) * 1000003u + static_cast<std::uint64_t>(tile.sample);
+            h = (h ^ h >> 31) * 0x9e3779b97f4a7c15u;
+            h = (h ^ h >> 29) * 0xbf58476d1ce4e5b9u;
+            const double random = static_cast<double>(h >> 11) * 0x1p-53;
+            const auto value = static_cast<float>(mean(x, y) + spread(x, y) * (2 * random - 1));
+            for (int c = 0; c < 3; ++c)
+                rgba[c] = value;
+            rgba[3] = 1;
+        });
+        while (bench::now() < until) {
+        }
+    }
+
+    static bench::ExactImage exact()
+    {
+        bench::ExactImage image{side};
+        for (int i = 0; i < side * side; ++i) {
+            const double grey = mean(i % side, i / side);
+            dfb::testing::Pixel pixel;
+            pixel.rgba = {grey, grey, grey, 1.0};
+            image.add(pixel);
+        }
+        return image;
+    }
+
+private:
+    // From the middle of the image, whose sides have length 1.
+    static double across(int x) { return (x + 0.5) / side - 0.5; }
+    static double distance(int x, int y) { return std::sqrt(across(x) * across(x) + across(y) * across(y)); }
+
+    static double mean(int x, int y) { return distance(x, y) < 0.2 ? 0.3 + 0.4 * (0.5 + across(x)) : 0.1; }
+    static double spread(int x, int y)
+    {
+        const double r = distance(x, y);
+        return r > 0.2 ? 0.0 : r > 0.18 || across(x) > 0 ? 0.25 : 0.05;
+    }
+};
+
 class Bench {
 public:
     Bench(MPI_Comm comm, Options o)
@@ -99,47 +148,15 @@ public:
         }
     }
 
-    // A disc with a noisy rim and half of it in noisy light before a background without any: what samples cost, of
-    // which each takes 1 us.
+    // The noisy disc: the time of samples, and how far they are from its mean.
     void noise()
     {
-        const int width = 256, height = 256;
-        const auto meanOf = [=](int x, int y) {
-            const double u = (x + 0.5) / width - 0.5, v = (y + 0.5) / height - 0.5, r = std::sqrt(u * u + v * v);
-            return r < 0.2 ? 0.3 + 0.4 * (0.5 + u) : 0.1;
-        };
-        const auto spreadOf = [=](int x, int y) {
-            const double u = (x + 0.5) / width - 0.5, v = (y + 0.5) / height - 0.5, r = std::sqrt(u * u + v * v);
-            return r > 0.2 ? 0.0 : r > 0.18 || u > 0 ? 0.25 : 0.05;
-        };
         using Op = dfb::Progressive<dfb::BasicImageParallel<16>>;
-        const auto render = [=](auto& tile) {
-            const double until = bench::now() + 1e-6 * tile.region.width() * tile.region.height();
-            tile.forEachPixel([&](int x, int y, float* rgba, float&) {
-                std::uint64_t h =
-                    static_cast<std::uint64_t>(y * width + x) * 1000003u + static_cast<std::uint64_t>(tile.sample);
-                h = (h ^ h >> 31) * 0x9e3779b97f4a7c15u;
-                h = (h ^ h >> 29) * 0xbf58476d1ce4e5b9u;
-                const double random = static_cast<double>(h >> 11) * 0x1p-53;
-                const auto value = static_cast<float>(meanOf(x, y) + spreadOf(x, y) * (2 * random - 1));
-                for (int c = 0; c < 3; ++c)
-                    rgba[c] = value;
-                rgba[3] = 1;
-            });
-            while (bench::now() < until) {
-            }
-        };
-        dfb::FrameBufferConfig c(width, height, dfb::OutputFormat::RGBA32F);
+        dfb::FrameBufferConfig c(NoisyDisc::side, NoisyDisc::side, dfb::OutputFormat::RGBA32F);
         c.executor = std::make_shared<dfb::ThreadExecutor>(1);
         dfb::DistributedFrameBuffer<Op> fb(comm_, c);
         dfb::ImageParallelLoop loop(fb, dfb::WorkDistribution::Dynamic);
-        bench::ExactImage exact{width};
-        for (int i = 0; i < width * height; ++i) {
-            dfb::testing::Pixel pixel;
-            for (std::size_t k = 0; k < 4; ++k)
-                pixel.rgba[k] = k == 3 ? 1.0 : meanOf(i % width, i / width);
-            exact.add(pixel);
-        }
+        const bench::ExactImage exact = NoisyDisc::exact();
         std::uint64_t accumulation = 1;
         std::vector<System> systems;
         const auto add = [&](const std::string& config, int samples, double threshold) {
@@ -148,7 +165,7 @@ public:
             s.config = config;
             s.output = "float";
             const auto bytes = std::make_shared<std::pair<std::int64_t, std::int64_t>>();
-            s.compositor.frame = [&fb, &loop, &accumulation, render, samples, threshold, bytes] {
+            s.compositor.frame = [&fb, &loop, &accumulation, samples, threshold, bytes] {
                 *bytes = {0, 0};
                 const auto take = [&](const dfb::FrameReport& report) {
                     bytes->first += report.bytesSent;
@@ -160,10 +177,10 @@ public:
                 if (threshold > 0) {
                     dfb::AdaptiveSampler sampler(fb.layout(), {threshold, 8, samples, 64});
                     while (!sampler.done())
-                        sampler.update(take(loop.render(render, sampler.next(params))));
+                        sampler.update(take(loop.render(NoisyDisc(), sampler.next(params))));
                 } else {
                     params.passes = samples;
-                    take(loop.render(render, params));
+                    take(loop.render(NoisyDisc(), params));
                 }
             };
             s.compositor.image = [&fb] { return fb.image().bytes(); };
@@ -184,7 +201,7 @@ public:
             for (int frame = -1; frame < frames; ++frame)
                 bench::timeFrame(comm_, timer, s, frame >= 0);
             bench::takeResult(comm_, s, exact); // before the next one's image is in the framebuffer
-            describe(s, "noise", width, height);
+            describe(s, "noise", NoisyDisc::side, NoisyDisc::side);
             if (rank_ == 0)
                 noise_.push_back(s.result);
         }
