@@ -386,64 +386,75 @@ inline void addRadixK(std::vector<System>& systems, const Inputs& inputs, const 
 }
 
 #ifdef DFB_BENCH_HAS_ICET
-// IceT with floats, and with bytes that are ready. With floats that become bytes: the image is converted within the
-// clock, or the inputs are; by the library's own conversion, which is faster than a plain loop.
+// With floats, and with bytes that are ready. With floats that become bytes: the image is converted within the clock,
+// or the inputs are; by the library's own conversion, which is faster than a plain loop.
+enum class IceTWay { Floats, FloatsToBytes, Bytes, BytesOfFloats };
+
+inline void toBytes(const float* from, std::size_t count, std::uint8_t* to)
+{
+    dfb::convertPixels(from, static_cast<int>(count / 4), dfb::OutputFormat::RGBA8, reinterpret_cast<std::byte*>(to));
+}
+
+// The part of an image that has pixels.
+inline void toBytes(const PartialImage& from, std::uint8_t* to)
+{
+    const auto [x, y, columns, rows] = from.viewport;
+    for (int row = y; row < y + rows; ++row) {
+        const std::size_t at = 4 * from.indexOf(x, row);
+        toBytes(&from.rgba[at], 4 * static_cast<std::size_t>(columns), to + at);
+    }
+}
+
+inline Compositor startIceT(const IceTStrategy& strategy, IceTWay way, const Inputs& inputs)
+{
+    const bool hasBytes = way == IceTWay::Bytes || way == IceTWay::BytesOfFloats;
+    const PartialImage& first = inputs.image();
+    const auto icet = std::make_shared<IceT>(inputs.comm, strategy, hasBytes, first.width, first.height);
+    const std::size_t values = first.rgba.size();
+    // Of all views if they are to be ready, else of one.
+    const auto bytes = std::make_shared<std::vector<std::vector<std::uint8_t>>>(
+        way == IceTWay::Floats ? 0 : inputs.views.size(), std::vector<std::uint8_t>(values));
+    for (std::size_t v = 0; way == IceTWay::Bytes && v < inputs.views.size(); ++v)
+        toBytes(inputs.views[v].image.rgba.data(), values, (*bytes)[v].data());
+    const auto out = std::make_shared<const void*>(nullptr);
+    Compositor compositor;
+    compositor.frame = [=, &inputs] {
+        const PartialImage& image = inputs.image();
+        std::uint8_t* const own = bytes->empty() ? nullptr : (*bytes)[inputs.frame % bytes->size()].data();
+        if (way == IceTWay::BytesOfFloats)
+            toBytes(image, own);
+        icet->resetTraffic();
+        const void* const input = hasBytes ? static_cast<const void*>(own) : image.rgba.data();
+        *out = icet->composite(input, image.viewport.data(), inputs.order());
+        if (way == IceTWay::FloatsToBytes && *out) {
+            toBytes(static_cast<const float*>(*out), values, own);
+            *out = own;
+        }
+    };
+    compositor.image = [out] { return *out; };
+    compositor.traffic = [icet] { return std::make_pair(icet->bytesSent(), icet->messagesSent()); };
+    return compositor;
+}
+
 inline void addIceT(std::vector<System>& systems, const Inputs& inputs)
 {
-    enum class Way { Floats, FloatsToBytes, Bytes, BytesOfFloats };
     const auto ranks = inputs.viewports().size();
     const bool isPowerOf2 = (ranks & (ranks - 1)) == 0;
-    const auto convert = [](const float* from, std::size_t count, std::uint8_t* to) {
-        dfb::convertPixels(from, static_cast<int>(count / 4), dfb::OutputFormat::RGBA8,
-                           reinterpret_cast<std::byte*>(to));
-    };
     for (const IceTStrategy& strategy : icetStrategies()) {
         const std::string name = strategy.name;
         // What "automatic" picks, and swaps of as many ranks as there is no power of 2 of, are others again.
         if (name.find("automatic") != std::string::npos || (isPowerOf2 && name.find("folding") != std::string::npos))
             continue;
-        for (const Way way : {Way::Floats, Way::FloatsToBytes, Way::Bytes, Way::BytesOfFloats}) {
-            const bool hasBytes = way == Way::Bytes || way == Way::BytesOfFloats;
+        for (const IceTWay way : {IceTWay::Floats, IceTWay::FloatsToBytes, IceTWay::Bytes, IceTWay::BytesOfFloats}) {
             System s;
             s.name = "icet";
-            s.config = (way == Way::Bytes           ? "ubyte, "
-                        : way == Way::BytesOfFloats ? "ubyte of floats, "
-                                                    : "float, ")
+            s.config = (way == IceTWay::Bytes           ? "ubyte, "
+                        : way == IceTWay::BytesOfFloats ? "ubyte of floats, "
+                                                        : "float, ")
                        + name;
-            s.output = way == Way::Floats ? "float" : "8 bit";
-            s.copied = way == Way::Floats ? 0 : 4;
-            s.start = [strategy, way, hasBytes, convert, &inputs] {
-                const PartialImage& first = inputs.image();
-                const auto icet = std::make_shared<IceT>(inputs.comm, strategy, hasBytes, first.width, first.height);
-                const std::size_t values = first.rgba.size();
-                // Of all views if they are to be ready, else of one.
-                const auto bytes = std::make_shared<std::vector<std::vector<std::uint8_t>>>(
-                    way == Way::Floats ? 0 : inputs.views.size(), std::vector<std::uint8_t>(values));
-                for (std::size_t v = 0; way == Way::Bytes && v < inputs.views.size(); ++v)
-                    convert(inputs.views[v].image.rgba.data(), values, (*bytes)[v].data());
-                const auto out = std::make_shared<const void*>(nullptr);
-                Compositor compositor;
-                compositor.frame = [=, &inputs] {
-                    const auto& v = inputs.image().viewport;
-                    const std::vector<float>& rgba = inputs.image().rgba;
-                    std::uint8_t* const own = bytes->empty() ? nullptr : (*bytes)[inputs.frame % bytes->size()].data();
-                    if (way == Way::BytesOfFloats)
-                        for (int y = v[1]; y < v[1] + v[3]; ++y) {
-                            const std::size_t at = 4 * inputs.image().indexOf(v[0], y);
-                            convert(&rgba[at], 4 * static_cast<std::size_t>(v[2]), own + at);
-                        }
-                    icet->resetTraffic();
-                    const void* const input = hasBytes ? static_cast<const void*>(own) : rgba.data();
-                    *out = icet->composite(input, v.data(), inputs.order());
-                    if (way == Way::FloatsToBytes && *out) {
-                        convert(static_cast<const float*>(*out), values, own);
-                        *out = own;
-                    }
-                };
-                compositor.image = [out] { return *out; };
-                compositor.traffic = [icet] { return std::make_pair(icet->bytesSent(), icet->messagesSent()); };
-                return compositor;
-            };
+            s.output = way == IceTWay::Floats ? "float" : "8 bit";
+            s.copied = way == IceTWay::Floats ? 0 : 4;
+            s.start = [strategy, way, &inputs] { return startIceT(strategy, way, inputs); };
             systems.push_back(std::move(s));
         }
     }
