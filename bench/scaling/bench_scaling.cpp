@@ -9,6 +9,7 @@
 // the first number of ranks. The exit status is 1 if a count is not that of its formula.
 #include "counted_transport.hpp"
 #include "options.hpp"
+#include "pixel_bricks.hpp"
 #include "plot.hpp"
 #include "results.hpp"
 #include "scenes.hpp"
@@ -308,15 +309,6 @@ struct Measured {
     dfb::FrameReport report;
 };
 
-// The boxes of bricks are in pixels.
-struct PixelCamera {
-    dfb::Region project(const dfb::Box3& box, int, int) const
-    {
-        return {static_cast<int>(box.lower.x), static_cast<int>(box.lower.y), static_cast<int>(box.upper.x),
-                static_cast<int>(box.upper.y)};
-    }
-};
-
 // `tracePath`: empty without a trace.
 Measured measure(const std::vector<bench::PartialImage>& images, int width, int height, int frames,
                  const std::string& tracePath)
@@ -337,11 +329,8 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
         const bench::Trace trace(tracePath);
         config.trace = trace.sink;
         FrameBuffer fb(connection, config);
-        dfb::World world;
-        const auto& v = image.viewport;
-        world.add({static_cast<std::uint32_t>(rank),
-                   {{static_cast<float>(v[0]), static_cast<float>(v[1]), 0},
-                    {static_cast<float>(v[0] + v[2]), static_cast<float>(v[1] + v[3]), 1}}});
+        const auto [left, top, columns, rows] = image.viewport;
+        const dfb::World world = bench::worldOf(communicator.rank(), {left, top, left + columns, top + rows});
         dfb::DataParallelLoop loop(fb, world);
         const auto find = dfb::inPlace([&image](const dfb::Brick&, auto& view) {
             const std::size_t first = image.indexOf(view.region.x0, view.region.y0);
@@ -355,7 +344,7 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
             counters->received[rank].reset();
             counters->meet();
             const double start = bench::now(), cpu = bench::processCpuSeconds();
-            const dfb::FrameReport report = loop.render(PixelCamera(), find);
+            const dfb::FrameReport report = loop.render(bench::PixelCamera(), find);
             counters->meet();
             if (rank == 0)
                 result.report = report;

@@ -7,6 +7,7 @@
 #include "clip.hpp"
 #include "counted_transport.hpp"
 #include "options.hpp"
+#include "pixel_bricks.hpp"
 #include "plot.hpp"
 #include "results.hpp"
 #include "trace.hpp"
@@ -91,25 +92,6 @@ private:
     std::vector<std::vector<float>> depths_; // of each rank
 };
 
-// The boxes of bricks are in pixels.
-struct PixelCamera {
-    dfb::Region project(const dfb::Box3& box, int, int) const
-    {
-        return {static_cast<int>(box.lower.x), static_cast<int>(box.lower.y), static_cast<int>(box.upper.x),
-                static_cast<int>(box.upper.y)};
-    }
-};
-
-dfb::World worldOf(int rank, const dfb::Region& region)
-{
-    dfb::World world;
-    if (!region.empty())
-        world.add({static_cast<std::uint32_t>(rank),
-                   {{static_cast<float>(region.x0), static_cast<float>(region.y0), 0},
-                    {static_cast<float>(region.x1), static_cast<float>(region.y1), 1}}});
-    return world;
-}
-
 // ---- frames
 
 // Of all ranks.
@@ -160,7 +142,8 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
         const bench::Trace trace(s.trace);
         config.trace = trace.sink;
         FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
-        const dfb::World world = worldOf(rank, s.knowsBounds ? picture.region() : dfb::Region{0, 0, s.width, s.height});
+        const dfb::World world =
+            bench::worldOf(rank, s.knowsBounds ? picture.region() : dfb::Region{0, 0, s.width, s.height});
         dfb::DataParallelLoop loop(fb, world);
         std::optional<dfb::SharedWorld> shared; // all bricks, front to back
         dfb::RoundRobinBricks owner;
@@ -189,9 +172,9 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
             dfb::FrameConfig params;
             params.maxLayers = ranks;
             if constexpr (TileOp::rule == dfb::BlendRule::InOrder)
-                orderedLoop->render(PixelCamera(), order, find, params);
+                orderedLoop->render(bench::PixelCamera(), order, find, params);
             else
-                loop.render(PixelCamera(), find, params);
+                loop.render(bench::PixelCamera(), find, params);
             const double end = bench::now();
             counters->meet();
             if (rank != 0)
@@ -351,7 +334,7 @@ Sampling sample(int width, int height)
         dfb::FrameBufferConfig config(width, height);
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
-        const dfb::World world = worldOf(fb.rank(), {0, 0, width, height});
+        const dfb::World world = bench::worldOf(fb.rank(), {0, 0, width, height});
         dfb::DataParallelLoop loop(fb, world);
         dfb::AdaptiveSampler sampler(fb.layout(), {0.02, 4, 256, 64});
         dfb::SamplePlan plan;
@@ -376,7 +359,7 @@ Sampling sample(int width, int height)
             counters->meet();
             dfb::FrameConfig params = sampler.next();
             plan = params.samples;
-            sampler.update(loop.render(PixelCamera(), render, params));
+            sampler.update(loop.render(bench::PixelCamera(), render, params));
             counters->meet();
         };
         int frames = 0;
