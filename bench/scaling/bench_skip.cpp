@@ -109,6 +109,13 @@ struct Settings {
     std::string trace{}; // the file for one; empty: none
 };
 
+void useCpu(double us)
+{
+    const double end = bench::threadCpuSeconds() + 1e-6 * us;
+    while (bench::threadCpuSeconds() < end) {
+    }
+}
+
 MessageCount countOf(const bench::Counters& counters, std::initializer_list<Kind> kinds)
 {
     MessageCount sum;
@@ -157,8 +164,7 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
         }
         const auto find = dfb::inPlace([&](const dfb::Brick&, auto& view) {
             ++rendered;
-            for (const double end = bench::threadCpuSeconds() + 1e-6 * s.renderUs; bench::threadCpuSeconds() < end;) {
-            }
+            useCpu(s.renderUs);
             picture.show(rank, view, zeros);
         });
         for (int frame = 0; frame < s.frames; ++frame) {
@@ -196,69 +202,79 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
 
 // ---- what is behind something opaque
 
-// Tiles of bricks in 36 views around them: all that they project to, those that had to be rendered as nothing opaque
-// hides them, and those that were.
+// Tiles of four bricks, a rank each, in views around them: all that they project to, those that had to be rendered as
+// nothing opaque hides them, and those that were.
 struct OrbitTiles {
     std::int64_t all = 0, needed = 0, rendered = 0;
 };
 
-// Four solid, opaque boxes, two by two, a rank each.
+constexpr int orbitViews = 36;
+
+dfb::PerspectiveCamera orbitCamera(int view)
+{
+    const double angle = 2 * 3.14159265358979 * (view + 0.5) / orbitViews;
+    return dfb::PerspectiveCamera({5 * static_cast<float>(std::sin(angle)), 1, 5 * static_cast<float>(std::cos(angle))},
+                                  {0, 0, 0}, {0, 1, 0}, 35);
+}
+
+// Solid and opaque boxes, two by two.
+dfb::Box3 orbitBox(int rank)
+{
+    const auto x = static_cast<float>(rank % 2), z = static_cast<float>(rank / 2);
+    return {{x - 1, -1, z - 1}, {x, 1, z}};
+}
+
+bool hits(const dfb::Box3& box, const dfb::PerspectiveCamera& camera, const dfb::TileLayout& layout, int x, int y)
+{
+    const dfb::Vec3 direction = camera.direction(x + 0.5, y + 0.5, layout.width(), layout.height());
+    float enter = 0, leave = 0;
+    return bench::clip(box, 0, camera.eye(), direction, enter, leave) && enter < leave;
+}
+
+// Adds those of a tile in a view. `order`: the bricks, front to back.
+void addTile(OrbitTiles& tiles, const dfb::Region& region, const dfb::TileLayout& layout, const dfb::SharedWorld& world,
+             const std::vector<int>& order, const dfb::PerspectiveCamera& camera)
+{
+    bool isHidden = false;
+    for (const int b : order) {
+        const dfb::Box3& box = world.bricks()[static_cast<std::size_t>(b)].bounds;
+        if (!camera.project(box, layout.width(), layout.height()).meets(region))
+            continue;
+        ++tiles.all;
+        tiles.needed += !isHidden;
+        int count = 0;
+        for (int y = region.y0; y < region.y1; ++y)
+            for (int x = region.x0; x < region.x1; ++x)
+                count += hits(box, camera, layout, x, y);
+        isHidden = isHidden || count == region.width() * region.height();
+    }
+}
+
 OrbitTiles orbitAround(int width, int height, double renderUs)
 {
     using FrameBuffer = dfb::DistributedFrameBuffer<dfb::OrderedBlend, dfb::NoPixelOp, dfb::InprocTransport>;
-    constexpr int views = 36;
-    const auto boxOf = [](int rank) {
-        const auto x = static_cast<float>(rank % 2), z = static_cast<float>(rank / 2);
-        return dfb::Box3{{x - 1, -1, z - 1}, {x, 1, z}};
-    };
-    const auto cameraOf = [](int view) {
-        const double angle = 2 * 3.14159265358979 * (view + 0.5) / views;
-        return dfb::PerspectiveCamera(
-            {5 * static_cast<float>(std::sin(angle)), 1, 5 * static_cast<float>(std::cos(angle))}, {0, 0, 0}, {0, 1, 0},
-            35);
-    };
-    const auto hits = [&](const dfb::Box3& box, const dfb::PerspectiveCamera& camera, int x, int y) {
-        const dfb::Vec3 eye = camera.eye(), d = camera.direction(x + 0.5, y + 0.5, width, height);
-        float enter = 0, leave = 0;
-        return bench::clip(box, 0, eye, d, enter, leave) && enter < leave;
-    };
     OrbitTiles tiles;
     std::atomic<std::int64_t> rendered{0};
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config(width, height);
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer fb(communicator, config);
-        const dfb::SharedWorld world(fb, dfb::World({{static_cast<std::uint32_t>(fb.rank()), boxOf(fb.rank())}}));
+        const dfb::SharedWorld world(fb, dfb::World({{static_cast<std::uint32_t>(fb.rank()), orbitBox(fb.rank())}}));
         dfb::RoundRobinBricks owner;
         dfb::OrderedLoop loop(fb, world, owner);
-        for (int view = -1; view < views; ++view) { // the first one is to be hidden by nobody
-            const dfb::PerspectiveCamera camera = cameraOf(view);
+        for (int view = -1; view < orbitViews; ++view) { // the first one is to be hidden by nobody
+            const dfb::PerspectiveCamera camera = orbitCamera(view);
             const std::vector<int> order = dfb::visibilityOrder(world, camera.eye());
             loop.render(camera, order, [&](const dfb::Brick& brick, auto& tile) {
                 rendered += view >= 0;
-                for (const double end = bench::threadCpuSeconds() + 1e-6 * renderUs; bench::threadCpuSeconds() < end;) {
-                }
+                useCpu(renderUs);
                 tile.forEachPixel([&](int x, int y, float* rgba, float&) {
-                    if (hits(brick.bounds, camera, x, y))
+                    if (hits(brick.bounds, camera, fb.layout(), x, y))
                         std::fill_n(rgba, 4, 1.0f);
                 });
             });
-            for (int t = 0; view >= 0 && fb.isDisplayRank() && t < fb.layout().tileCount(); ++t) {
-                bool isHidden = false;
-                const dfb::Region region = fb.layout().region(t);
-                for (const int b : order) {
-                    const dfb::Box3& box = world.bricks()[static_cast<std::size_t>(b)].bounds;
-                    if (!camera.project(box, width, height).meets(region))
-                        continue;
-                    ++tiles.all;
-                    tiles.needed += !isHidden;
-                    int count = 0;
-                    for (int y = region.y0; y < region.y1; ++y)
-                        for (int x = region.x0; x < region.x1; ++x)
-                            count += hits(box, camera, x, y);
-                    isHidden = isHidden || count == region.width() * region.height();
-                }
-            }
+            for (int t = 0; view >= 0 && fb.isDisplayRank() && t < fb.layout().tileCount(); ++t)
+                addTile(tiles, fb.layout().region(t), fb.layout(), world, order, camera);
         }
     });
     tiles.rendered = rendered;
