@@ -15,13 +15,13 @@ namespace bench {
 struct Result {
     std::string bench, system, config, scene;
     int ranks = 0, width = 0, height = 0;
-    Figure ms, cpuMs, yieldMs;      // yieldMs: of the CPU time, what waiting ranks have given away
-    double bytes = 0, messages = 0; // of all ranks, a frame
+    std::string commit{};
+    Figure ms{}, cpuMs{}, yieldMs{}; // yieldMs: of the CPU time, what waiting ranks have given away
+    double bytes = 0, messages = 0;  // of all ranks, a frame
     double maxError = 0, rmse = 0;
     int levels = 0;              // by which an 8-bit value is off at most
     double peakMemoryBytes = -1; // of the rank with the most; below 0: not known
-    std::string commit;
-    std::string more{}; // further keys: , "key": value
+    std::string more{};          // further keys: , "key": value
 
     // The CPU time that was not given away while waiting.
     double workMs() const { return cpuMs.median - yieldMs.median; }

@@ -171,18 +171,9 @@ private:
 
     bench::Result resultOf(const MarchedSystem& s, const char* what, const Figure& ms, const Figure& cpuMs) const
     {
-        bench::Result r;
-        r.bench = "bench_overlap";
-        r.system = s.name.substr(0, s.name.find_first_of(":,"));
-        r.config = s.name + what;
-        r.scene = "64^3 bricks, " + std::to_string(o_.views) + " views";
-        r.ranks = ranks_;
-        r.width = width_;
-        r.height = height_;
-        r.commit = o_.commit;
-        r.ms = ms;
-        r.cpuMs = cpuMs;
-        return r;
+        const std::string system = s.name.substr(0, s.name.find_first_of(":,"));
+        const std::string scene = "64^3 bricks, " + std::to_string(o_.views) + " views";
+        return {"bench_overlap", system, s.name + what, scene, ranks_, width_, height_, o_.commit, ms, cpuMs};
     }
 
     void reportInARow(const std::vector<MarchedSystem>& systems) const

@@ -553,15 +553,7 @@ private:
     bench::Result resultOf(const std::string& system, const std::string& config, const std::string& scene,
                            int ranks) const
     {
-        bench::Result r;
-        r.bench = "scaling";
-        r.system = system;
-        r.config = config;
-        r.scene = scene;
-        r.ranks = ranks;
-        r.width = o_.width, r.height = o_.height;
-        r.commit = o_.commit;
-        return r;
+        return {"scaling", system, config, scene, ranks, o_.width, o_.height, o_.commit};
     }
 
     // Of all ranks in the last frame.

@@ -449,17 +449,10 @@ private:
 
     void keep(const std::string& config, const FrameCost& cost, const std::string& more)
     {
-        bench::Result r;
-        r.bench = "skip";
-        r.system = "dfb";
-        r.config = config;
-        r.scene = "square";
-        r.ranks = ranks;
-        r.width = o_.width, r.height = o_.height;
+        bench::Result r{"skip", "dfb", config, "square", ranks, o_.width, o_.height, o_.commit};
         r.ms = cost.ms;
         r.bytes = static_cast<double>(cost.all.bytes);
         r.messages = static_cast<double>(cost.all.messages);
-        r.commit = o_.commit;
         r.more = more;
         results_.push_back(std::move(r));
     }
