@@ -66,6 +66,19 @@ inline void readOptions(int argc, char** argv, const char* usage,
         std::exit(name == "--help" ? 0 : 2);
     }
 }
+
+// A reader of a whole number.
+template <class Number>
+std::function<bool(const std::string&)> readNumber(Number& to, int least)
+{
+    return [&to, least](const std::string& value) {
+        char* end = nullptr;
+        const long n = std::strtol(value.c_str(), &end, 10);
+        to = static_cast<Number>(n);
+        return *end == 0 && !value.empty() && n >= least && n < 1000000000;
+    };
+}
+
 // A reader that keeps the text.
 inline std::function<bool(const std::string&)> readText(std::string& text)
 {

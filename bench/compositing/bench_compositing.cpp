@@ -390,7 +390,7 @@ Options optionsOf(int argc, char** argv)
         {{"--scene", readScenes},
          {"--size", bench::readSizes(o.sizes)},
          {"--systems", readSystems},
-         {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
+         {"--frames", bench::readNumber(o.frames, 1)},
          {"--only", bench::readText(o.only)},
          {"--json", bench::readText(o.json)},
          {"--table", bench::readText(o.table)},

@@ -344,7 +344,7 @@ Options optionsOf(int argc, char** argv)
         "usage: mpirun -n RANKS bench_error_time [--size WxH] [--frames N] [--json FILE] [--table FILE] [--commit ID] "
         "[--only TEXT] [--trace FILE]",
         {{"--size", [&o](const std::string& value) { return bench::readSize(value, o.width, o.height); }},
-         {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
+         {"--frames", bench::readNumber(o.frames, 1)},
          {"--json", bench::readText(o.json)},
          {"--table", bench::readText(o.table)},
          {"--trace", bench::readText(o.trace)},

@@ -285,14 +285,6 @@ private:
 Options optionsOf(int argc, char** argv)
 {
     Options o;
-    const auto number = [](auto& to, int least) {
-        return [&to, least](const std::string& value) {
-            char* end = nullptr;
-            const long n = std::strtol(value.c_str(), &end, 10);
-            to = static_cast<std::decay_t<decltype(to)>>(n);
-            return *end == 0 && !value.empty() && n >= least && n < 1000000000;
-        };
-    };
     const auto isCompression = [&o](const std::string& value) {
         o.compress = value;
 #if defined(DFB_HAS_SNAPPY)
@@ -311,7 +303,7 @@ Options optionsOf(int argc, char** argv)
         "  --repeats N    frames of each view";
     bench::readOptions(
         argc, argv, usage,
-        {{"--figure", number(o.figure, 6)},
+        {{"--figure", bench::readNumber(o.figure, 6)},
          {"--ranks",
           [&o](const std::string& value) {
               for (const std::string& part : bench::partsOf(value, ','))
@@ -319,13 +311,13 @@ Options optionsOf(int argc, char** argv)
               return !o.ranks.empty() && o.ranks.front() > 0 && std::is_sorted(o.ranks.begin(), o.ranks.end());
           }},
          {"--size", bench::readSizes(o.sizes)},
-         {"--views", number(o.views, 1)},
-         {"--repeats", number(o.repeats, 1)},
+         {"--views", bench::readNumber(o.views, 1)},
+         {"--repeats", bench::readNumber(o.repeats, 1)},
          {"--scale", [&o](const std::string& value) { return (o.scale = std::atof(value.c_str())) > 0; }},
-         {"--seed", number(o.seed, 0)},
-         {"--threads", number(o.threads, 1)},
+         {"--seed", bench::readNumber(o.seed, 0)},
+         {"--threads", bench::readNumber(o.threads, 1)},
          {"--compress", isCompression},
-         {"--check", number(o.checked, 0)},
+         {"--check", bench::readNumber(o.checked, 0)},
          {"--json", bench::readText(o.json)},
          {"--svg", bench::readText(o.svg)},
          {"--table", bench::readText(o.table)},

@@ -11,7 +11,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <cstdlib>
 #include <memory>
 #include <string>
 #include <utility>
@@ -267,8 +266,8 @@ Options optionsOf(int argc, char** argv)
         "                    --table and --trace have no effect then\n"
         "  --commit ID       is written to the JSON file",
         {{"--size", bench::readSizes(o.sizes)},
-         {"--views", [&o](const std::string& value) { return (o.views = std::atoi(value.c_str())) > 0; }},
-         {"--in-a-row", [&o](const std::string& value) { return (o.inARow = std::atoi(value.c_str())) > 0; }},
+         {"--views", bench::readNumber(o.views, 1)},
+         {"--in-a-row", bench::readNumber(o.inARow, 1)},
          {"--json", bench::readText(o.json)},
          {"--table", bench::readText(o.table)},
          {"--trace", bench::readText(o.trace)},

@@ -745,7 +745,7 @@ Options optionsOf(int argc, char** argv)
         {{"--ranks", readRanks},
          {"--size", readSize},
          {"--scenes", readScenes},
-         {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
+         {"--frames", bench::readNumber(o.frames, 1)},
          {"--rig", readNetwork(o.rig)},
          {"--hpc", readNetwork(o.hpc)},
          {"--pixel-ns",

@@ -627,7 +627,7 @@ Options optionsOf(int argc, char** argv)
         "       bench_skip --frames-of full|empty [--size WxH] [--frames N] [--trace FILE]\n"
         "  --frames-of  renders so many frames of a full or an empty image and measures nothing: for a profiler",
         {{"--size", [&o](const std::string& value) { return bench::readSize(value, o.width, o.height); }},
-         {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
+         {"--frames", bench::readNumber(o.frames, 1)},
          {"--frames-of", readContent},
          {"--json", bench::readText(o.json)},
          {"--svg", bench::readText(o.svg)},
