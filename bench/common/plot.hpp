@@ -21,23 +21,60 @@ struct PlotLine {
     bool isDashed = false;
 };
 
-// Both axes logarithmic, or both linear from 0 on.
+class PlotAxis {
+public:
+    // Linear from 0 on, or logarithmic.
+    explicit PlotAxis(bool isLogarithmic) : isLogarithmic_(isLogarithmic), low_(isLogarithmic ? 1e300 : 0) {}
+
+    void include(double v)
+    {
+        low_ = std::min(low_, scaled(v));
+        high_ = std::max(high_, scaled(v));
+    }
+    void widenToDecades()
+    {
+        low_ = std::floor(low_);
+        high_ = std::ceil(high_);
+    }
+
+    // From 0 to 1.
+    double placeOf(double v) const { return (scaled(v) - low_) / std::max(high_ - low_, 1e-9); }
+
+    // Powers of `base`, or tenths of a linear axis.
+    std::vector<double> marks(double base) const
+    {
+        std::vector<double> at;
+        if (!isLogarithmic_)
+            for (int i = 0; i <= 10; ++i)
+                at.push_back(low_ + std::max(high_ - low_, 1e-9) * i / 10);
+        else
+            for (double e = std::ceil(low_ / std::log10(base) - 1e-3); e <= high_ / std::log10(base) + 1e-3; ++e)
+                at.push_back(std::pow(base, e));
+        return at;
+    }
+
+private:
+    double scaled(double v) const { return isLogarithmic_ ? std::log10(v) : v; }
+
+    bool isLogarithmic_;
+    double low_, high_ = -1e300; // scaled
+};
+
+// Both axes logarithmic, or both linear.
 inline void writePlot(const std::string& path, const std::string& title, const std::string& xLabel,
                       const std::string& yLabel, const std::vector<PlotLine>& lines, bool isLogarithmic)
 {
     constexpr double left = 80, top = 60, plotWidth = 620, plotHeight = 440;
-    const auto scaled = [&](double v) { return isLogarithmic ? std::log10(v) : v; };
-    double x0 = isLogarithmic ? 1e300 : 0, x1 = -1e300, y0 = x0, y1 = x1;
+    PlotAxis xAxis(isLogarithmic), yAxis(isLogarithmic);
     for (const PlotLine& line : lines)
         for (const auto& [x, y] : line.points) {
-            x0 = std::min(x0, scaled(x)), x1 = std::max(x1, scaled(x));
-            y0 = std::min(y0, scaled(y)), y1 = std::max(y1, scaled(y));
+            xAxis.include(x);
+            yAxis.include(y);
         }
-    if (isLogarithmic) // whole decades
-        y0 = std::floor(y0), y1 = std::ceil(y1);
-    x1 = std::max(x1, x0 + 1e-9), y1 = std::max(y1, y0 + 1e-9);
-    const auto px = [&](double x) { return left + plotWidth * (scaled(x) - x0) / (x1 - x0); };
-    const auto py = [&](double y) { return top + plotHeight * (1 - (scaled(y) - y0) / (y1 - y0)); };
+    if (isLogarithmic)
+        yAxis.widenToDecades();
+    const auto px = [&](double x) { return left + plotWidth * xAxis.placeOf(x); };
+    const auto py = [&](double y) { return top + plotHeight * (1 - yAxis.placeOf(y)); };
 
     std::ofstream svg(path);
     svg << R"(<svg xmlns="http://www.w3.org/2000/svg" width="980" height="560" font-family="sans-serif" font-size="12">)"
@@ -51,26 +88,11 @@ inline void writePlot(const std::string& path, const std::string& title, const s
             << "\" stroke=\"#ddd\"/>\n";
     };
     const auto number = [](double v) { return text("%.6g", v); };
-    const auto marks = [&](double low, double high, bool powersOfTwo) {
-        std::vector<double> at;
-        if (!isLogarithmic)
-            for (int i = 0; i <= 10; ++i)
-                at.push_back(low + (high - low) * i / 10);
-        else if (powersOfTwo)
-            for (double v = 1; v <= std::pow(10, high) * 1.001; v *= 2) {
-                if (v >= std::pow(10, low) * 0.999)
-                    at.push_back(v);
-            }
-        else
-            for (double e = low; e <= high; ++e)
-                at.push_back(std::pow(10, e));
-        return at;
-    };
-    for (const double v : marks(x0, x1, true)) {
+    for (const double v : xAxis.marks(2)) {
         rule(px(v), top, px(v), top + plotHeight);
         label(px(v), top + plotHeight + 18, number(v), "text-anchor=\"middle\"");
     }
-    for (const double v : marks(y0, y1, false)) {
+    for (const double v : yAxis.marks(10)) {
         rule(left, py(v), left + plotWidth, py(v));
         label(left - 8, py(v) + 4, number(v), "text-anchor=\"end\"");
     }
