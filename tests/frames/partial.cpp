@@ -189,11 +189,7 @@ struct CancelledFrames {
                                   what + ": " + outcome);
                 }
                 const dfb::FrameReport report = renderLoop(fb, s, scene::Loop::Listing3);
-                if (fb.isDisplayRank()) {
-                    const scene::Picture picture(fb.image(), report);
-                    result.expect(wrongValues(picture, referenceOf(s)) == 0, what + ": the frame after");
-                    result.hash = picture.hash();
-                }
+                result.hash = checkedHash(result, fb, report, s, what + ": the frame after");
             }
         return result;
     }

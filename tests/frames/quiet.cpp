@@ -123,11 +123,7 @@ struct MissingInputs {
                                               what + ": tile " + std::to_string(tile) + " is complete or not");
                     }
                     const dfb::FrameReport report = renderLoop(fb, s, scene::Loop::Declared);
-                    if (fb.isDisplayRank()) {
-                        const scene::Picture picture(fb.image(), report);
-                        result.expect(wrongValues(picture, referenceOf(s)) == 0, what + ": the frame after");
-                        result.hash = picture.hash();
-                    }
+                    result.hash = checkedHash(result, fb, report, s, what + ": the frame after");
                 }
         }
         return result;
@@ -146,11 +142,7 @@ struct QuietOthers {
                           what + ": " + (failure ? failure->describe() : "no failure"));
         };
         const auto isRight = [&](const FrameBuffer& fb, const dfb::FrameReport& report, const std::string& what) {
-            if (!fb.isDisplayRank())
-                return;
-            const scene::Picture picture(fb.image(), report);
-            result.expect(wrongValues(picture, referenceOf(s)) == 0, what + ": values");
-            result.hash = picture.hash();
+            result.hash = checkedHash(result, fb, report, s, what);
         };
         auto config = quickConfig(s);
         {

@@ -59,12 +59,9 @@ struct Distributions {
             if (distribution == WorkDistribution::Linear || distribution == WorkDistribution::RoundRobin)
                 result.expect(most == (84 + fb.size() - 1) / fb.size(),
                               name + ": " + std::to_string(most) + " on a rank");
-            if (!fb.isDisplayRank())
-                continue;
-            const scene::Picture picture(fb.image(), report);
-            result.expect(wrongValues(picture, referenceOf(s)) == 0, name + ": values");
-            result.expect(result.hash == 0 || result.hash == picture.hash(), name + ": another image");
-            result.hash = picture.hash();
+            const std::uint64_t hash = checkedHash(result, fb, report, s, name);
+            result.expect(result.hash == 0 || result.hash == hash, name + ": another image");
+            result.hash = hash;
         }
         return result;
     }
@@ -148,12 +145,7 @@ struct Accumulation {
                     result.expect(report.tilesTouched <= tiles - (tiles + 2) / 3,
                                   std::to_string(report.tilesTouched) + " tiles touched");
             }
-            if (!fb.isDisplayRank())
-                continue;
-            const scene::Picture picture(fb.image(), report);
-            const std::size_t wrong = wrongValues(picture, referenceOf(s));
-            result.expect(wrong == 0, std::to_string(wrong) + " values in run " + std::to_string(run));
-            result.hash = result.hash * 31 + picture.hash();
+            result.hash = result.hash * 31 + checkedHash(result, fb, report, s, "run " + std::to_string(run));
         }
     }
 

@@ -10,6 +10,7 @@
 #include "random_scene.hpp"
 #include "shuffled.hpp"
 
+#include <cstddef>
 #include <cstdint>
 #include <mutex>
 #include <string>
@@ -26,6 +27,19 @@ struct Result {
             wrong += (wrong.empty() ? "" : "; ") + what;
     }
 };
+
+// Expects the display rank to have the image of a scene. Returns the image's hash there, and 0 on other ranks.
+template <class FrameBuffer>
+std::uint64_t checkedHash(Result& result, const FrameBuffer& fb, const dfb::FrameReport& report, const scene::Scene& s,
+                          const std::string& what)
+{
+    if (!fb.isDisplayRank())
+        return 0;
+    const scene::Picture picture(fb.image(), report);
+    const std::size_t wrong = wrongValues(picture, referenceOf(s));
+    result.expect(wrong == 0, what + ": " + std::to_string(wrong) + " values");
+    return picture.hash();
+}
 
 using Transport = AnyTransport; // of all cases
 using Run = Result (*)(const Transport::Communicator&);
