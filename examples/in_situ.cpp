@@ -343,7 +343,7 @@ struct Sight {
 constexpr float wholeView = 2.4f; // the distance, in sides of the grid, from which all of it is in the image
 
 // The view of a step, from a slow orbit around a grid of n^3 voxels.
-Sight orbit(int n, int step)
+Sight orbit(int n, std::int64_t step)
 {
     const float angle = 0.6f + 6e-4f * float(step), c = std::cos(angle), s = std::sin(angle);
     return {0.5f * float(n - 1) * Vec3{1, 1, 1}, dfb::normalize(Vec3{c, 0.5f, s}), wholeView * float(n), c, s};
@@ -428,7 +428,7 @@ public:
     bool isLive() const { return isLive_; }
     const example::LiveWishes& wishes() const { return wishes_; }
 
-    void show(const dfb::FrameReport& report, int step)
+    void show(const dfb::FrameReport& report, std::int64_t step)
     {
         if (!view_)
             return;
@@ -490,7 +490,7 @@ std::string run(MPI_Comm comm, const Options& options)
 
     dfb::World world; // boxes around what is visible of this rank's slabs
     dfb::DataParallelLoop loop(fb, world);
-    const auto render = [&](int step) {
+    const auto render = [&](std::int64_t step) {
         const example::LiveWishes& wishes = viewers.wishes();
         if (viewers.isLive() && (wishes.width != fb.layout().width() || wishes.height != fb.layout().height()))
             fb.resize(wishes.width, wishes.height);
@@ -511,7 +511,8 @@ std::string run(MPI_Comm comm, const Options& options)
     };
 
     double simulationTime = 0, renderingTime = 0;
-    int frames = 0, step = 0;
+    std::int64_t step = 0;
+    int frames = 0;
     while (options.steps == 0 || step < options.steps) {
         if (!viewers.mayGoOn(step % options.every != 0, [&] { render(step); }))
             break;
@@ -538,8 +539,9 @@ std::string run(MPI_Comm comm, const Options& options)
         fb.allReduce({std::int64_t(1e6 * simulationTime), std::int64_t(1e6 * renderingTime)}, FrameBuffer::Reduce::Max);
     const double simulated = 1e-6 * double(longest[0]), rendered = 1e-6 * double(longest[1]);
     if (fb.isDisplayRank())
-        std::printf("%d ranks: %d steps of %d^3 voxels in %.3f s, %d pictures in %.3f s, %.1f %% of the run\n", ranks,
-                    step, n, simulated, frames, rendered, 100 * rendered / (simulated + rendered));
+        std::printf("%d ranks: %lld steps of %d^3 voxels in %.3f s, %d pictures in %.3f s, %.1f %% of the run\n", ranks,
+                    static_cast<long long>(step), n, simulated, frames, rendered,
+                    100 * rendered / (simulated + rendered));
     return {};
 }
 

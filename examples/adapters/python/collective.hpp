@@ -33,17 +33,23 @@ public:
     {
         auto connection = connect(comm);
         views_.emplace(connection->pool());
-        const py::gil_scoped_release released;
-        object_ = make(std::move(connection));
+        {
+            const py::gil_scoped_release released;
+            object_ = make(std::move(connection));
+        }
+        const auto& image = object_->config().image;
+        rank_ = object_->rank(), size_ = object_->size(), displayRank_ = image.displayRank;
+        width_ = image.width, height_ = image.height;
     }
     Collective(const Collective&) = delete;
     Collective& operator=(const Collective&) = delete;
 
-    int rank() const { return object().rank(); }
-    int size() const { return object().size(); }
-    int width() const { return object().config().image.width; }
-    int height() const { return object().config().image.height; }
-    int displayRank() const { return object().config().image.displayRank; }
+    // These may be read while another thread is in a call, and from what such a call calls.
+    int rank() const { return open(rank_); }
+    int size() const { return open(size_); }
+    int width() const { return open(width_); }
+    int height() const { return open(height_); }
+    int displayRank() const { return open(displayRank_); }
     bool isClosed() const { return !object_; }
 
     // The last picture on the display rank, else None.
@@ -81,6 +87,7 @@ public:
             py::raise_from(error, PyExc_BufferError, why.c_str());
             throw py::error_already_set();
         }
+        width_ = to[0], height_ = to[1];
     }
 
     // Arrays of the image stay valid.
@@ -90,8 +97,9 @@ public:
             return;
         const Use use(*this);
         views_.reset();
+        auto ended = std::move(object_);
         const py::gil_scoped_release released;
-        object_.reset();
+        ended.reset();
     }
 
     // Replaces close() on a rank that leaves because of an exception, when the others may never reach their close().
@@ -103,9 +111,10 @@ public:
         const Use use(*this);
         views_.reset();
         struct Left {};
+        auto left = std::move(object_);
         const py::gil_scoped_release released;
         try {
-            const auto ended = std::move(object_); // its connection checks whether there is an exception
+            const auto ended = std::move(left); // its connection checks whether there is an exception
             throw Left();
         } catch (const Left&) {
         }
@@ -141,6 +150,12 @@ protected:
     const dfb::FrameConfig& frame() const noexcept { return frame_; }
 
 private:
+    int open(int value) const
+    {
+        object();
+        return value;
+    }
+
     // Collective. Throws InvalidArgument on all ranks, with the reason of the lowest rank that has one, if `why` is not
     // empty everywhere. `call`: see dfb::ImageCompositor::allGather().
     void refuseTogether(const std::string& why, const char* call)
@@ -165,6 +180,7 @@ private:
     std::unique_ptr<Object> object_;
     std::optional<ImageViews> views_;
     bool isInUse_ = false;
+    int rank_ = 0, size_ = 1, displayRank_ = 0, width_ = 0, height_ = 0; // calls may replace the object's own
 };
 
 } // namespace dfb_python

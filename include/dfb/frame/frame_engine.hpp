@@ -413,12 +413,10 @@ private:
         const auto expected = std::count_if(tiles.begin(), tiles.end(), [&](int tile) {
             return isKept(tile) || (!params_.declared && samples(tile).count > 0);
         });
-        std::optional<ErrorInfo> failure;
+        std::optional<ErrorInfo> failure; // end() throws it on all ranks, and nothing is made with half of the data
         if (userError)
             failure = errorInfoOf(userError, {});
-        auto& early = open_.open();
-        if (failure) // first of all: end() throws it on all ranks, and nothing is made with half of the frame's data
-            outcome_->failWhole(*failure);
+        auto& early = outcome_->open(std::move(failure));
         open_.expectTiles(expected);
         for (Arrival& a : early)
             incoming(a.source, a.header, std::move(a.message));

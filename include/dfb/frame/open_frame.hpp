@@ -49,16 +49,18 @@ public:
     // ---- transitions
 
     // Opens the next frame and returns its messages that came too early. The caller must take them before the next
-    // open(). Throws InvalidArgument if a frame is open.
-    std::vector<Arrival>& open()
+    // open(). With an error the frame has failed from the start, and the caller tells the others. Throws
+    // InvalidArgument if a frame is open.
+    std::vector<Arrival>& open(const std::optional<ErrorInfo>& error = std::nullopt)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (state_ != FrameState::Closed)
             failArgument("begin() while a frame is open: end() it first");
         number_ += step_;
-        state_ = FrameState::Rendering;
-        error_.reset();
-        failed_ = damaged_ = false;
+        state_ = error ? FrameState::Failed : FrameState::Rendering;
+        error_ = error;
+        failed_ = error.has_value();
+        damaged_ = false;
         tilesLeft_ = 0;
         areTilesKnown_ = areTilesFinished_ = false;
         hasInPlace_ = false;

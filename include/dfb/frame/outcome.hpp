@@ -70,6 +70,23 @@ public:
         }
     }
 
+    // Opens the next frame, as OpenFrame::open() does. With `reason` it has failed before any message is taken: this
+    // rank's parameters may not be complete then, so messages could seem wrong.
+    std::vector<Arrival>& open(std::optional<ErrorInfo> reason)
+    {
+        if (reason) {
+            reason->rank = mailbox_.rank();
+            reason->frame = frame_.next();
+            tellOthers(*reason); // before this rank's vote
+        }
+        auto& early = frame_.open(reason);
+        if (reason) {
+            dropRest(reason->kind);
+            tryVote();
+        }
+        return early;
+    }
+
     // Reports that something went wrong on this rank. The frame fails, or goes on without the lost part if it may be
     // partial. Returns false if this rank has voted already, so that its vote does not contain the error.
     bool fail(ErrorInfo reason)
@@ -87,13 +104,8 @@ public:
     {
         reason = placed(std::move(reason));
         const OpenFrame::Failure failure = frame_.fail(reason);
-        if (failure.isFirst) {
-            Bytes body;
-            put(body, reason);
-            for (int other = 0; other < mailbox_.size(); ++other)
-                if (other != mailbox_.rank())
-                    mailbox_.send(other, MessageKind::Abort, frame_.number(), body);
-        }
+        if (failure.isFirst)
+            tellOthers(reason);
         if (!failure.inTime)
             frame_.countLate(); // too late to matter to this frame
         dropRest(reason.kind);
@@ -272,6 +284,15 @@ public:
 
 private:
     ReductionKey verdictKey() const { return {FrameVerdict, frame_.number()}; }
+
+    void tellOthers(const ErrorInfo& info)
+    {
+        Bytes body;
+        put(body, info);
+        for (int other = 0; other < mailbox_.size(); ++other)
+            if (other != mailbox_.rank())
+                mailbox_.send(other, MessageKind::Abort, info.frame, body);
+    }
 
     ErrorInfo placed(ErrorInfo info) const
     {

@@ -276,7 +276,7 @@ public:
                         printed(samples(tile).count > 1 ? "%stile %d pass %d: " : "%stile %d: ", tiles > 1 ? "; " : "",
                                 tile, pass);
                     info.message += m->text();
-                    info.message += listOf("; missing source ", m->inputs, m->inputs.size());
+                    info.message += listOf("; missing source ", m->inputs);
                     info.message += listOf("; announced by source ", m->announcers);
                     info.message += listOf("; here are source ", m->arrived);
                 }
@@ -382,9 +382,9 @@ private:
             tree.declare(inputs);
     }
 
-    static std::string listOf(const char* what, const std::vector<DependencyTracker::Declared>& inputs,
-                              std::size_t most = 8)
+    static std::string listOf(const char* what, const std::vector<DependencyTracker::Declared>& inputs)
     {
+        constexpr std::size_t most = 8; // each rank sends the text to all others
         std::string text;
         for (std::size_t i = 0; i < std::min(most, inputs.size()); ++i) {
             text += printed("%s%u", i == 0 ? what : ", ", inputs[i].source);

@@ -1651,8 +1651,10 @@ TEST_CASE("A camera that throws on one rank is why a frame fails, also if its vo
         }
     });
     REQUIRE(texts.size() == 20);
-    for (const std::string& text : texts)
+    for (const std::string& text : texts) {
+        INFO(text);
         CHECK(has(text, "no such eye"));
+    }
 }
 
 TEST_CASE("Of a partial frame only the tile is lost whose operation cannot be made", "[errors]")

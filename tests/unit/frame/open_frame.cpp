@@ -34,6 +34,7 @@ dfb::ErrorInfo errorOf(dfb::ErrorKind kind)
 // All events of a frame.
 const std::vector<std::pair<const char*, std::function<void(OpenFrame&)>>> events{
     {"open", [](OpenFrame& f) { f.open(); }},
+    {"open, failed", [](OpenFrame& f) { f.open(errorOf(dfb::ErrorKind::UserCode)); }},
     {"finish", [](OpenFrame& f) { f.finish(); }},
     {"fail", [](OpenFrame& f) { f.fail(errorOf(dfb::ErrorKind::UserCode)); }},
     {"note", [](OpenFrame& f) { f.note(errorOf(dfb::ErrorKind::UserCode)); }},
@@ -75,20 +76,24 @@ TEST_CASE("Every event in every state leads to the state that the drawing shows"
         std::vector<S> to; // by event
     };
     const std::vector<Row> rows{
-        // open        finish       fail         note          done         not done      may not       decide
-        //     close
+        // open     open, failed  finish       fail         note          done         not done      may not
+        //     decide  close
         {S::Closed,
-         {S::Rendering, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed}},
+         {S::Rendering, S::Failed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed,
+          S::Closed}},
         {S::Rendering,
-         {S::Rendering, S::Finishing, S::Failed, S::Rendering, S::Rendering, S::Rendering, S::Rendering, S::Rendering,
-          S::Closed}},
+         {S::Rendering, S::Rendering, S::Finishing, S::Failed, S::Rendering, S::Rendering, S::Rendering, S::Rendering,
+          S::Rendering, S::Closed}},
         {S::Finishing,
-         {S::Finishing, S::Finishing, S::Failed, S::Finishing, S::Voted, S::Finishing, S::Finishing, S::Finishing,
-          S::Closed}},
-        {S::Failed, {S::Failed, S::Failed, S::Failed, S::Failed, S::Voted, S::Voted, S::Failed, S::Failed, S::Closed}},
-        {S::Voted, {S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Decided, S::Closed}},
+         {S::Finishing, S::Finishing, S::Finishing, S::Failed, S::Finishing, S::Voted, S::Finishing, S::Finishing,
+          S::Finishing, S::Closed}},
+        {S::Failed,
+         {S::Failed, S::Failed, S::Failed, S::Failed, S::Failed, S::Voted, S::Voted, S::Failed, S::Failed, S::Closed}},
+        {S::Voted,
+         {S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Voted, S::Decided, S::Closed}},
         {S::Decided,
-         {S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Closed}}};
+         {S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided, S::Decided,
+          S::Closed}}};
     REQUIRE(rows.size() == 6);
     for (const Row& row : rows) {
         REQUIRE(row.to.size() == events.size());
@@ -96,7 +101,7 @@ TEST_CASE("Every event in every state leads to the state that the drawing shows"
             INFO("in state " << static_cast<int>(row.from) << ": " << events[e].first);
             const auto frame = frameIn(row.from);
             REQUIRE(frame->state() == row.from);
-            const bool isRefused = e == 0 && row.from != S::Closed; // a frame that is open already
+            const bool isRefused = e < 2 && row.from != S::Closed; // a frame that is open already
             if (isRefused)
                 CHECK_THROWS_AS(events[e].second(*frame), dfb::InvalidArgument);
             else
@@ -134,6 +139,13 @@ TEST_CASE("What a failure says depends on whether this rank has voted, and who w
     CHECK(frame.vote(yes, yes));
     failure = frame.fail(errorOf(dfb::ErrorKind::UserCode));
     CHECK((failure.isFirst && !failure.inTime && frame.failed()));
+    frame.close(noHelp);
+
+    frame.open(errorOf(dfb::ErrorKind::UserCode)); // the caller has told the others
+    CHECK(frame.failed());
+    CHECK_FALSE(frame.fail(errorOf(dfb::ErrorKind::MalformedMessage)).isFirst);
+    CHECK(frame.reason()->kind == dfb::ErrorKind::UserCode);
+    CHECK(frame.vote(no, yes));
     frame.close(noHelp);
 }
 

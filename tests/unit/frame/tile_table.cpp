@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <memory>
 #include <stdexcept>
+#include <string>
 #include <utility>
 #include <vector>
 
@@ -179,6 +180,28 @@ TEST_CASE("The operations of tiles that move away are used for those that come",
     CHECK(!frame(same, {1, 2}));
     CHECK(frame(nullptr, {0, 1}));
     CHECK(operations.made == 2);
+}
+
+TEST_CASE("The text about missing inputs stays short, however many there are", "[tile_table]")
+{
+    Operations operations(None);
+    const dfb::TileLayout layout(128, 64, 64);
+    dfb::detail::TileTable table(
+        layout, [](int, const dfb::TileLayout&, int) { return 0; }, 0, 1, operations);
+    table.newFrame({}, nullptr);
+    std::vector<dfb::detail::ExpectedInput> inputs;
+    for (std::uint32_t source = 0; source < 1000; ++source)
+        inputs.push_back({{0, source, 0}, 0});
+    dfb::detail::ExpectedInputs expected;
+    expected.replace({0}, std::move(inputs));
+    dfb::ErrorInfo where;
+    table.declare(
+        expected, where, [](int) {}, [](int) {});
+    const dfb::ErrorInfo missing = table.missing();
+    CHECK(missing.tile == 0);
+    CHECK(missing.expected == 1000);
+    CHECK(missing.message.find(" and 992 more") != std::string::npos);
+    CHECK(missing.message.size() < 300);
 }
 
 } // namespace tile_table_cases
