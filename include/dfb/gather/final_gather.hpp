@@ -548,8 +548,8 @@ private:
         }
         const std::lock_guard<std::mutex> lock(mutex_);
         TilesOf& its = tilesOf_[static_cast<std::size_t>(source)];
-        if (its.announced || count.tiles < 0 || count.tiles > its.owned || count.batches < 0
-            || count.batches > count.tiles)
+        if (!isSender(static_cast<std::size_t>(source)) || its.announced || count.tiles < 0 || count.tiles > its.owned
+            || count.batches < 0 || count.batches > count.tiles)
             failMalformed("a count of tiles that cannot be", its.owned, count.tiles);
         its.announced = count;
         addReceived(its, placed);
