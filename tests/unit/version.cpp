@@ -1,6 +1,7 @@
 // The namespace of a version: two versions of the library that are compiled into one process have different names.
 #include "catch.hpp"
 
+#include <dfb/base/double_double.hpp>
 #include <dfb/image.hpp>
 
 #include <string>
