@@ -41,6 +41,7 @@ std::uint64_t fingerprint(const List& list, const WordOf& wordOf)
 struct Agreement {
     struct OnNode {
         std::int32_t rank = 0, first = 0; // the lowest rank of its node
+        std::int32_t hasFarRanks = 0;     // 1: it shares no memory with some other rank
     };
 
     bool fine = true;

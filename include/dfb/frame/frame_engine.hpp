@@ -57,13 +57,20 @@ public:
                 failArgument("%s; there is one for each of %d frames in flight", e.what(), config_.framesInFlight);
             }
             const Connection& network = mailbox_->connection();
-            return Agreement::of(traits(), config_, network.config().checksums, {rank(), network.firstOnNode()},
+            Agreement::OnNode here{rank(), network.firstOnNode()};
+            for (int other = 0; other < size(); ++other)
+                here.hasFarRanks |= isFar(other);
+            return Agreement::of(traits(), config_, network.config().checksums, here,
                                  TilePipeline::travelling(traits(), config_), pipeline_->table().ownersByMap());
         });
         nodeOf_.resize(static_cast<std::size_t>(size()));
+        bool hasFarRanks = false;
         for (const Agreement::OnNode& its : all.nodes)
-            if (its.rank < size())
+            if (its.rank < size()) {
                 nodeOf_[static_cast<std::size_t>(its.rank)] = its.first;
+                hasFarRanks = hasFarRanks || its.hasFarRanks != 0;
+            }
+        pipeline_->setFarRanks(hasFarRanks);
         tellImagePlace();
     }
     ~FrameEngine() override { mailbox_->stop(); } // while mailbox_ is not null yet: its tasks use it
@@ -722,16 +729,13 @@ private:
 
     void makeParts()
     {
-        bool hasFarRanks = false;
-        for (int other = 0; other < size(); ++other)
-            hasFarRanks = hasFarRanks || isFar(other);
         const auto sendToDisplay = [this](Buffer&& message, std::size_t raw) {
             if (raw > 0)
                 compression_.sent(config_.image.displayRank, raw, message.size());
             mailbox_->send(config_.image.displayRank, std::move(message));
         };
         pipeline_ = std::make_unique<TilePipeline>(
-            pool_, config_, operations_, rank(), size(), hasFarRanks, mailbox_->address(), sendToDisplay,
+            pool_, config_, operations_, rank(), size(), mailbox_->address(), sendToDisplay,
             [this](const std::exception_ptr& reason, int tile) { failTile(reason, tile); });
         outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_, config_.quiet,
                                                   [this](Verdict& verdict) { addFigures(verdict); });

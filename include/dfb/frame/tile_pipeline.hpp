@@ -31,20 +31,24 @@ namespace detail {
 
 class TilePipeline {
 public:
-    // `config` and `operations` must live as long as this. `hasFarRanks`: whether there are ranks that share no memory
-    // with this one. Throws InvalidArgument for an impossible configuration.
+    // `config` and `operations` must live as long as this. Throws InvalidArgument for an impossible configuration.
     TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, Operations& operations, int rank,
-                 int rankCount, bool hasFarRanks, std::uint32_t address, FinalGather::Send sendToDisplay,
-                 FinalGather::Fail fail)
+                 int rankCount, std::uint32_t address, FinalGather::Send sendToDisplay, FinalGather::Fail fail)
         : pool_(std::move(pool)), config_(config), address_(address), operations_(operations),
-          budget_(budgetOf(config, hasFarRanks)),
           table_(TileLayout(config.image.width, config.image.height, traits().tileWidth, traits().tileHeight),
                  config.image.ownerMap ? config.image.ownerMap : latticeOwner, rank, rankCount, operations),
           gather_(
               pool_, table_.layout(), config, imageChannels(config), address, rank, rankCount,
-              [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay), std::move(fail)),
-          coder_(config.precision, traits().activeByDepth, traits().readsInPlace && !isLossy())
+              [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay), std::move(fail))
     {
+    }
+
+    // Must be called before the first frame, with the same value on all ranks. `hasFarRanks`: whether there are two
+    // ranks that share no memory.
+    void setFarRanks(bool hasFarRanks)
+    {
+        budget_ = budgetOf(config_, hasFarRanks);
+        coder_ = WireCoder(config_.precision, traits().activeByDepth, traits().readsInPlace && !isLossy());
     }
 
     // Returns the image's channels beside colour.
@@ -430,13 +434,13 @@ private:
     const FrameBufferConfig& config_;
     std::uint32_t address_; // of the framebuffer
     Operations& operations_;
-    const double budget_; // of the error of colours, see budgetOf()
+    double budget_ = 0; // of the error of colours, see budgetOf()
     TileTable table_;
     FinalGather gather_;
     ChannelMask sent_ = 0; // of the inputs of this frame
     std::array<float, 4> background_{};
     bool backgroundIsFine_ = true; // see finishBackground()
-    const WireCoder coder_;
+    WireCoder coder_;
     std::atomic<WireFormat> wireColor_{WireFormat::Float32};
     WireLosses losses_;
     FaultCounts faults_;

@@ -9,6 +9,7 @@
 #include <dfb/comm/mpi_transport.hpp>
 #include <dfb/dfb.hpp>
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstddef>
@@ -118,6 +119,52 @@ TEST_CASE("Owners that see the image of the display rank send it no tiles", "[sh
     }
     CHECK(messages[true] == messages[false] - others);      // a batch each
     CHECK((others == 0 || bytes[true] > bytes[false] / 2)); // the bytes that they write there count
+}
+
+// Rank 0 and any other rank see each other's memory. No other two ranks do, as if one could map no more of it.
+struct SeenByRank0 : dfb::MpiTransport {
+    using MpiTransport::MpiTransport;
+    bool lendsTo(int other) const noexcept { return (rank() == 0 || other == 0) && MpiTransport::lendsTo(other); }
+    std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const noexcept
+    {
+        return rank() == 0 || other == 0 ? MpiTransport::blockAt(other, place, byteCount) : nullptr;
+    }
+};
+
+TEST_CASE("With half a level, ranks agree on how inputs come, whoever sees whom", "[shared_image]")
+{
+    dfb::FrameBufferConfig config(64, 64);
+    config.precision = dfb::HalfLevel{};
+    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, SeenByRank0> fb(MPI_COMM_WORLD, config);
+    dfb::Buffer memory = fb.sharedMemory(16 * 16 * 5 * sizeof(float)); // all tiles get the same pixels
+    float* const pixels = reinterpret_cast<float*>(memory.data());
+    std::fill_n(pixels, 16 * 16 * 5, 0.0f);
+    pixels[0] = pixels[3] = 1;
+    dfb::FrameConfig params;
+    params.maxLayers = fb.size();
+    auto frame = fb.begin(params);
+    for (int tile = 0; tile < fb.layout().tileCount(); ++tile) {
+        decltype(fb)::TileView view;
+        frame.start(view, tile, 0);
+        view.generation = 1;
+        view.color = pixels;
+        view.depth = pixels + 16 * 16 * 4;
+        view.stride = 16;
+        view.staysUntilEnd = true;
+        frame.setTile(view);
+        if (fb.tileOwner(tile) == fb.rank()) {
+            decltype(fb)::TileView parent;
+            frame.start(parent, tile, 0);
+            parent.children = fb.size();
+            frame.setTile(parent);
+        }
+    }
+    const auto report = frame.end();
+    CHECK(report.wireErrorBound <= 0.5 / 255);
+    if (fb.isDisplayRank()) {
+        CHECK(fb.image().rgba8()[4 * 16] == 255);
+        CHECK(fb.image().rgba8()[4 * 17] == 0);
+    }
 }
 
 TEST_CASE("From an owner that does not leave the image is taken away", "[shared_image]")

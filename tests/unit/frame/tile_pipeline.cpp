@@ -21,7 +21,8 @@ std::string outcomeOf(const dfb::detail::OperationTraits& traits, dfb::WireForma
     d::OperationsOf<Op, dfb::NoPixelOp> operations(dfb::NoPixelOp(), traits);
     dfb::FrameBufferConfig config(8, 8);
     config.precision = format;
-    d::TilePipeline pipeline(dfb::MemoryPool::create(), config, operations, 0, 1, false, 0, nullptr, nullptr);
+    d::TilePipeline pipeline(dfb::MemoryPool::create(), config, operations, 0, 1, 0, nullptr, nullptr);
+    pipeline.setFarRanks(false);
     const dfb::FrameConfig params;
     pipeline.newFrame(0, params, {}, false);
     const std::vector<float> pixels(4 * 64);
