@@ -58,7 +58,7 @@ bool verdicts(const fuzz::Input& in)
         return !refused([&] {
             const d::Verdict v = d::Verdict::from(one);
             fuzz::require(isSame(v.bytes(), one), "a verdict comes back");
-            fuzz::require(!v.error || v.error->kind <= dfb::ErrorKind::Transport, "an error has a kind");
+            fuzz::require(!v.error || v.error->kind <= dfb::ErrorKind::MissingInput, "an error has a kind");
             dfb::FrameReport report;
             v.addTo(report);
         });
@@ -364,6 +364,8 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     bad.error->rank = 3;
     bad.mergeErrors = {{3, 0.5}, {4, 1}};
     addTwo("verdicts_lists", Verdict, bad, bad);
+    bad.error->kind = dfb::ErrorKind::MissingInput; // the last that there is
+    addTwo("verdicts_missing", Verdict, good, bad);
     const d::Agreement a{true, "width=4\ntiles=8\n", 0}, b{true, "width=4\ntiles=16\n", 1}, c{false, "no", 2};
     addTwo("agreement", Agreement, a, a);
     addTwo("agreement_differs", Agreement, a, b);
