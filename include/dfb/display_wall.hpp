@@ -40,8 +40,8 @@ struct ToWall {
 //   wall.finish(report.frame);
 //   ... wall.image(display) on the rank that drives it
 //
-// Memory: a rank that drives displays has the image of each that it shows, and one more for each frame of which parts
-// have come before its finish(), 16 at most. The constructor takes memory for one of these; if there is none for
+// Memory: for each display that it drives, a rank has the image that is shown, and one more for each frame (16 at most)
+// of which parts have come before its finish(). The constructor takes memory for one of these; if there is none for
 // another, the connection fails. At most `poolBytes` are on the way to such a rank.
 class DisplayWall {
 public:
@@ -54,7 +54,8 @@ public:
 
     DisplayWall(const DisplayWall&) = delete;
     DisplayWall& operator=(const DisplayWall&) = delete;
-    // Collective. Destroy the framebuffers that send to it first. The last object of a connection waits for all ranks.
+    // Collective. Destroy the framebuffers that send to it first. Whoever releases the connection last waits for all
+    // ranks.
     ~DisplayWall();
 
     const WallLayout& layout() const noexcept { return layout_; }
@@ -63,14 +64,14 @@ public:
     FrameBufferConfig frameBufferConfig() const { return {layout_.width(), layout_.height(), OutputFormat::None}; }
 
     // Waits until all displays have frame number `frame`: that is the moment to show it on all of them. Collective.
-    // Call it once for each frame, after the frame has ended, in the order of the frames. A display's rank keeps parts
-    // of 16 frames at most, and drops the oldest if later ones come. All frames of a wall must be of one framebuffer,
-    // before its resize(). Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks:
-    // TimedOut if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have
-    // not sent all of it, because it failed or was partial, or if a display has dropped it; MalformedMessage if a part
-    // of it cannot be right. The displays then keep their picture. Throws TransportError if the connection fails.
-    // Throws InvalidArgument, on this rank alone, on a thread that may not call MPI, or for a frame that is not later
-    // than the last or that no rank can have begun.
+    // Call it after a frame has ended, once, in the order of the frames. A frame may be left out. A display's rank
+    // keeps parts of 16 frames at most, and drops the oldest if later ones come. All frames of a wall must be of one
+    // framebuffer, before its resize(). Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same
+    // on all ranks: TimedOut if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if
+    // the ranks have not sent all of it, because it failed or was partial, or if a display has dropped it;
+    // MalformedMessage if a part of it cannot be right. The displays then keep their picture. Throws TransportError if
+    // the connection fails. Throws InvalidArgument, on this rank alone, on a thread that may not call MPI, or for a
+    // frame that is not later than the last or that no rank can have begun.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before

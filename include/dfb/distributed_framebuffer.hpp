@@ -25,8 +25,8 @@ DFB_NAMESPACE_BEGIN
 
 // One object per rank. Construction and destruction are collective over the communicator. One thread at a time may call
 // the constructor, begin(), end(), isDone() and the collective members. On a thread that may not call MPI (see
-// Progress) these throw InvalidArgument, on this rank alone; a constructor that gets a communicator throws
-// TransportError.
+// Progress in comm/transport.hpp) these throw InvalidArgument, on this rank alone; a constructor that gets a
+// communicator throws TransportError.
 template <class TileOp, class PixelOp, class Transport>
 class DistributedFrameBuffer {
     static_assert(detail::checkTileOp<TileOp>());
@@ -153,8 +153,9 @@ public:
         JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
         // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. Use it for
-        // measurements that all ranks must know, such as the cost of a brick. The figures are summed when the frame
-        // ends: call it before this rank's end().
+        // measurements that all ranks must know, such as the cost of a brick. If the loop has a tile-brick owner that
+        // plans, the loop adds figures, too, with the keys of MeasuredCostBricks::keyOf(). The figures are summed when
+        // the frame ends: call it before this rank's end().
         void addFigure(std::uint64_t key, double value) const { engine_->addFigure(key, value); }
 
         // Notes that an input of that tile was simplified, so that a pixel of one pass may be off by up to `bound`, in
@@ -320,8 +321,8 @@ public:
     DistributedFrameBuffer(const DistributedFrameBuffer&) = delete;
     DistributedFrameBuffer& operator=(const DistributedFrameBuffer&) = delete;
 
-    // Collective. If a frame is open, it ends the process by std::abort(). Must come before MPI_Finalize(). The last
-    // object of a connection waits for all ranks.
+    // Collective. If a frame is open, it ends the process by std::abort(). Must come before MPI_Finalize(). Whoever
+    // releases the connection last waits for all ranks: this, another object on it, or your own shared_ptr.
     ~DistributedFrameBuffer()
     {
         for (const auto& engine : engines_)
@@ -409,7 +410,7 @@ public:
     }
 
     // Returns memory for pixels that all ranks of the node can read: see TileView::staysUntilEnd. It is not cleared,
-    // and aligned to 64 bytes. If it is small (1536 bytes), or there is no shared memory, or no more of it (4 GiB a
+    // and aligned to 64 bytes. If it has at most 1536 bytes, or there is no shared memory, or no more of it (4 GiB a
     // rank), it is memory of this rank alone, and pixels in it must be sent. Any thread. Waits for nothing. Throws
     // OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }

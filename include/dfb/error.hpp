@@ -159,7 +159,7 @@ private:
     std::shared_ptr<const void> whileThrown_;
 };
 
-// A wrong argument, or a call that is not allowed now or on this thread. Nothing has changed.
+// A wrong argument, or a call that is not allowed now or on this thread. No framebuffer has changed.
 class InvalidArgument : public Error {
 public:
     using Error::Error;

@@ -181,13 +181,13 @@ struct FrameSums {
     std::int64_t orderUndefinedPixels = 0; // of finished tiles, see TileReport
     std::int64_t compressedLinks = 0;      // pairs of sender and receiver for which compression paid
     // Messages with pixels that were dropped since the last verdict, because their frame had failed, or because an
-    // opaque input that came sooner hides them. A failure after a rank's vote counts as well.
+    // opaque input that came sooner hides them.
     std::int64_t lateMessages = 0;
     std::int64_t repeatedMessages = 0; // messages that came twice and were dropped, since the last verdict
 };
 
-// Figures of a finished frame. Those marked "all" are sums or maxima over the ranks, and the same on all of them; they
-// include what each rank counted until it entered the verdict. The others are this rank's own.
+// Figures of a finished frame. FrameSums and those marked "all" are the same on all ranks. They include what
+// each rank counted until it entered the verdict. The others are this rank's own.
 struct FrameReport : FrameSums {
     std::int64_t frame = 0;
     std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why tiles are missing, if any are
@@ -203,7 +203,7 @@ struct FrameReport : FrameSums {
     Progress progress = Progress::Thread;
     int threads = 1;                            // this rank: workers of its executor
     std::int64_t tilesTotal = 0;                // in the image
-    WireFormat wireColor = WireFormat::Float32; // how this rank's inputs travelled, except those out of range
+    WireFormat wireColor = WireFormat::Float32; // in which format this rank rounded inputs, see Precision
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     // All: how far colour and alpha of a pixel may be off because of Precision and minTransmittance. Depth, positions
     // and ids are exact.
@@ -211,7 +211,7 @@ struct FrameReport : FrameSums {
     double mergeErrorBound = 0;        // all: how far a pixel may be off because segments were merged, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: the sums of Frame::addFigure(), by key
-    std::int64_t peakInboxBytes = 0;   // all: the most bytes limited by messages.poolBytes that a rank's inbox held
+    std::int64_t peakInboxBytes = 0;   // all: the most that a rank's inbox held of what messages.poolBytes limits
     std::int64_t peakMemoryBytes = 0;  // all: the most message and image memory that a rank's connection ever held
 };
 

@@ -73,9 +73,9 @@ template <class Real>
 double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out);
 
 // convertPixels() with dithered colour, if the format has 8 bits; (x, y) is the place of the first pixel in the image.
-// Alpha is rounded, not dithered. A colour value that is at most alpha gets no level above the one that alpha would get
-// if it were a colour, with ties going to the lower level. So in RGBA8 it stays at most alpha. This lowers it by half a
-// level at most. Returns the largest rounding distance of alpha, as convertPixels() does.
+// Alpha is rounded, not dithered. A colour that is at most alpha gets at most the level that alpha would get as a
+// colour (ties go down). So in RGBA8 it stays at most alpha. This lowers it by half a level at most. Returns the
+// largest rounding distance of alpha, as convertPixels() does.
 template <class Real>
 double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int y, std::byte* out);
 
@@ -195,7 +195,7 @@ private:
     std::array<Buffer, detail::channelCount> planes_;
 };
 
-// Writes the colours of an image to a file that any image viewer opens: a PPM file, 8 bits a channel, without alpha.
+// Writes the colours of an image to a file that most image viewers open: a PPM file, 8 bits a channel, without alpha.
 // RGBA32F becomes sRGB; 8-bit images are written as they are. Replaces an existing file. Not collective: call it on a
 // rank that has an image. Any thread. Throws InvalidArgument if the image is empty, and then writes nothing, or if the
 // file cannot be written, which may leave a part of it.
@@ -204,7 +204,7 @@ DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image);
 DFB_NAMESPACE_END
 
 #if DFB_HAS_BODIES
-#include <dfb/levels.hpp>
+#include <dfb/base/levels.hpp>
 
 DFB_NAMESPACE_BEGIN
 

@@ -61,8 +61,8 @@ struct InputImage {
     // A pixel at this depth or beyond is empty; 1 in OpenGL. Infinity: no limit.
     float farDepth = std::numeric_limits<float>::infinity();
     // The part of the picture that the memory holds; pixels outside of the picture are not read. x counts from the
-    // left, y from the first row in memory. {0, 0, 0, 0}: the whole picture. Any other region of width or height 0:
-    // this rank has nothing to show. A region of negative width or height is an error.
+    // left, y from the top, with bottomUp from the bottom. {0, 0, 0, 0}: the whole picture. Any other region of width
+    // or height 0: this rank has nothing to show. A region of negative width or height is an error.
     Region region{0, 0, 0, 0};
     // Pixels outside of this part of the picture are empty and not read. Its coordinates are those of `region`. By
     // default it is everything.
@@ -74,8 +74,8 @@ struct InputImage {
 };
 
 // One object per rank. Construction, destruction, resize(), composite(), end(), imageOnAllRanks() and allGather() are
-// collective. One thread at a time may call members; they work on all threads of config.executor. Members that are not
-// collective wait for no other rank, except that start() may wait for room.
+// collective. One thread at a time may call members, except sharedMemory(). They work on all threads of
+// config.executor. Members that are not collective wait for no other rank, except that start() may wait for room.
 class ImageCompositor {
 public:
     // Makes a compositor on a connection. config.image: the picture of the display rank. config.framesInFlight becomes
@@ -91,8 +91,8 @@ public:
 
     ImageCompositor(const ImageCompositor&) = delete;
     ImageCompositor& operator=(const ImageCompositor&) = delete;
-    // Collective. The last object of a connection waits for all ranks. Must come before MPI_Finalize(). An open picture
-    // fails on all ranks.
+    // Collective. Whoever releases the connection last waits for all ranks. Must come before MPI_Finalize(). An open
+    // picture fails on all ranks.
     ~ImageCompositor()
     {
         if (engine_->isOpen())

@@ -12,8 +12,9 @@
 //   static constexpr ChannelMask channels;       the channels its inputs have (Tile<channels, tileSize>)
 //   void newFrame(const TileInfo&);              forget the last frame; or, with a FrameData,
 //   void newFrame(const TileInfo&, const FrameData&);
-//   void add(Fragment&&);                        keep one input; cheap; any arrival order
-//   void finish(FinishedTile&);                  all inputs have come: write every row; heavy, once, as a task
+//   void add(Fragment&&);                        keep one input; quick; inputs come in any order
+//   void finish(FinishedTile&);                  all inputs have come: write every row; called
+//                                                once, in a task; may take long
 //
 // Optional:
 //   static constexpr int tileSize;               pixels a side, 8 to 256; default 64
@@ -105,7 +106,7 @@ public:
     {
     }
 
-    // Stores float colours past the cache from now on: see streamPixels().
+    // Uses non-temporal stores for float colours from now on: see streamPixels().
     void storePastCache() noexcept { isPastCache_ = format_ == OutputFormat::RGBA32F; }
 
     const Region& region() const noexcept { return region_; }
@@ -335,7 +336,7 @@ constexpr bool checkTileOp()
 DFB_NAMESPACE_END
 
 #if DFB_HAS_BODIES
-#include <dfb/levels.hpp>
+#include <dfb/base/levels.hpp>
 
 DFB_NAMESPACE_BEGIN
 

@@ -19,7 +19,7 @@ set(calls_of_mpi
 
 # Headers that must not include others, even indirectly. Rooms are folders. Of the headers at the root, those that
 # define a tile and what is made of it count as pixels.
-set(pixels "^((image|levels|tile|tile_layout|fragment|dependency_tracker|channels|tile_op|pixel_op)|(blend|ops)/.*)\\.hpp$")
+set(pixels "^((image|tile|tile_layout|fragment|dependency_tracker|channels|tile_op|pixel_op)|(blend|ops)/.*)\\.hpp$")
 set(messages "^(comm)/.*\\.hpp$")
 set(loops "^(render)/.*\\.hpp$")
 set(frames "^(frame|gather)/.*\\.hpp$")

@@ -2,8 +2,8 @@
 // set.
 #include "catch.hpp"
 
+#include <dfb/base/levels.hpp>
 #include <dfb/blend/compositing.hpp>
-#include <dfb/levels.hpp>
 #include <dfb/ops/image_parallel.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/adversarial.hpp>

@@ -1,8 +1,8 @@
 // Image: exact rounding to the output formats, and access to the channels of an image.
 #include "catch.hpp"
 
+#include <dfb/base/levels.hpp>
 #include <dfb/image.hpp>
-#include <dfb/levels.hpp>
 #include <dfb/testing/reference.hpp>
 
 #include <algorithm>

@@ -3,13 +3,13 @@
 #pragma once
 
 #include <dfb/base/cpu.hpp>
+#include <dfb/base/levels.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/accumulation.hpp>
 #include <dfb/frame/operations.hpp>
 #include <dfb/frame/tile_table.hpp>
 #include <dfb/frame/verdict.hpp>
 #include <dfb/gather/final_gather.hpp>
-#include <dfb/levels.hpp>
 #include <dfb/wire/fragment_message.hpp>
 #include <dfb/wire/wire_losses.hpp>
 

@@ -191,8 +191,8 @@ public:
 
 } // namespace detail
 
-// Sorts the inputs of each pixel by (depth, source, part). Accepts any tree. Empty inputs (a background tile that only
-// announces children, "nothing here") count for the tree and cost nothing. Accuracy: see compositing.hpp; the mean over
+// Sorts the inputs of each pixel by (depth, source, part). Accepts any dependency tree (dependency_tracker.hpp).
+// Empty inputs count in the tree and are not blended. Accuracy: see blend/compositing.hpp; the mean over
 // n passes adds at most n * 2^-53 relative. With farChannel, pixels in which inputs overlap in depth are counted, since
 // their order is undefined. Channels beside colour, depth and farChannel travel only if the image has them. With
 // FrameConfig::order, inputs are blended in that order, without a sort; not with farChannel.

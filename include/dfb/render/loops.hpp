@@ -36,8 +36,8 @@ struct InPlace {
 
 // Makes a renderer for any loop except DeepParallelLoop out of pixels that are there already, such as an image that a
 // rank has made by itself. find(brick, view), or find(view) for ImageParallelLoop, points the planes of a TileView to
-// the pixels of view.region; a view left without colour is empty. Several threads call it at once. Unless it sets
-// staysUntilEnd, the pixels may change when it is called for the next tile on the same thread.
+// the pixels of view.region; a view left without colour is empty. Several threads call it at once. Pixels are copied,
+// and may change when it is called for the next tile on the same thread, unless it sets staysUntilEnd.
 template <class Find>
 InPlace<Find> inPlace(Find find)
 {
@@ -88,8 +88,8 @@ private:
 
 } // namespace detail
 
-// Which rank renders which tile (section 4.1.1 of the paper). All but Owned deal out passes like tiles, so a tile that
-// needs many samples is rendered by many ranks; the image does not depend on which rank renders a tile.
+// Which rank renders which tile (section 4.1.1 of the paper). All but Owned deal out pairs of tile and pass, so a tile
+// that needs many samples is rendered by many ranks; the image does not depend on which rank renders a tile.
 enum class WorkDistribution : std::uint8_t {
     Owned,      // a rank renders the tiles that it owns: no input travels
     Linear,     // equal contiguous shares in the order of tiles

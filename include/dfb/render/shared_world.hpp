@@ -26,8 +26,8 @@ struct SharedBrick : Brick {
 class SharedWorld {
 public:
     // Gathers the bricks of all ranks. Bricks with the same id are the same brick. Collective, outside frames. Waits
-    // for all ranks. Throws InvalidArgument on all ranks if the bounds of one brick differ between ranks, or if the
-    // bricks of a rank cannot be read. Throws TransportError.
+    // and throws as DistributedFrameBuffer::allGather(). Also throws InvalidArgument on all ranks if the bounds of one
+    // brick differ between ranks, or if the bricks of a rank cannot be read.
     template <class FrameBuffer>
     SharedWorld(FrameBuffer& fb, const World& world)
     {

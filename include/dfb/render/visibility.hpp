@@ -32,7 +32,7 @@ struct PixelPoint {
     double x = 0, y = 0;
 };
 
-// The convex part of an image that a convex thing may cover.
+// A convex polygon of an image: what a convex body may cover.
 class Footprint {
 public:
     Footprint() = default; // nothing

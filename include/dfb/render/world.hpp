@@ -70,9 +70,9 @@ inline bool isBox(const Box3& b) noexcept
 
 } // namespace detail
 
-// A convex region of space that overlaps no other brick, with the data in it. Camera rays see it within `bounds` only:
-// renderers clip them to it. Its data may reach farther: ghost voxels, or geometry for shadows and ambient occlusion,
-// which secondary rays see beyond the bounds as well.
+// A convex region of space, with the data in it. Only in a DeepParallelLoop may it overlap another brick. Camera rays
+// see it within `bounds` only: renderers clip them to it. Its data may reach farther: ghost voxels, or geometry for
+// shadows and ambient occlusion, which secondary rays see beyond the bounds as well.
 struct Brick {
     std::uint32_t id = 0; // equal on two ranks: the same brick, whose bounds must be equal in a SharedWorld
     Box3 bounds;

@@ -2,8 +2,8 @@
 // to be far from a tie are far from it.
 #include "catch.hpp"
 
+#include <dfb/base/levels.hpp>
 #include <dfb/image.hpp>
-#include <dfb/levels.hpp>
 #include <dfb/testing/adversarial.hpp>
 
 #include <algorithm>
