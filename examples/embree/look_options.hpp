@@ -26,8 +26,9 @@ public:
         add("--target", target_, "X,Y,Z", "The point that it looks at; default: the centre of what there is to see",
             camera);
         add("--up", up_, "X,Y,Z|x|y|z|-x|-y|-z",
-            "Direction that is up in the image, and the axis of the orbit. In volume files y and z run downwards; "
-            "default y, and -z for data that look like computed tomography, so that the body stands upright if its "
+            "Direction that is up in the image, and the axis of the orbit. In volume files y and z run downwards, "
+            "except with --no-fit; default y, and -z (with --no-fit z) for data that look like computed tomography, so "
+            "that the body stands upright if its "
             "slices go from the feet to the head",
             camera);
         const char* look = "Look";
@@ -99,7 +100,7 @@ public:
     static void requireTransfer(const std::string& transfer, const std::string& option, const std::string& where = {})
     {
         const std::vector<std::string> names = transferNames();
-        if (transfer.empty() || std::find(names.begin(), names.end(), transfer) != names.end()
+        if (transfer.empty() || transfer == "auto" || std::find(names.begin(), names.end(), transfer) != names.end()
             || detail::checkEnding(transfer, {".json"}).empty())
             return;
         std::string all = "auto";

@@ -21,7 +21,8 @@ namespace {
 Scene makeScene(const Options& options, int brickCount, const Loaders& loaders)
 {
     LookOf look;
-    if (!options.look.transfer.empty() || options.look.range || !options.look.isovalues.empty())
+    const std::string& transfer = options.look.transfer;
+    if ((!transfer.empty() && transfer != "auto") || options.look.range || !options.look.isovalues.empty())
         look = [&](const VolumeSource& source) { return lookOf(source, options.look, loaders); };
     if (options.scene.front() == "synthetic")
         return syntheticScene(brickCount, options.seed, look);
@@ -72,9 +73,9 @@ RankScene loadRankScene(const Options& options, const Loaders& loaders)
     RenderSettings settings = options;
     RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes, {}};
     if (!settings.view.isUpGiven && stands(scene)) {
-        settings.view.up = {0, 0, -1};
-        result.notes.push_back(
-            "this looks like computed tomography, with the last slice at the top: --up z turns it over");
+        settings.view.up = {0, 0, options.fit ? -1.0f : 1.0f};
+        result.notes.push_back("this looks like computed tomography, with the last slice at the top: --up "
+                               + std::string(options.fit ? "z" : "-z") + " turns it over");
     }
     result.view = settings.view;
     if (scene.volumes.empty())

@@ -20,8 +20,8 @@
 
 namespace example {
 
-// Scanners store the rows of an image from the top, so a volume is placed with y down and also with z backwards;
-// otherwise it would be its own mirror image.
+// Scanners store the rows of an image from the top, so a volume that is fitted is placed with y down and also with z
+// backwards; otherwise it would be its own mirror image.
 struct VolumeObject {
     VolumeSource source;
     Placement placement;        // of voxels by their index, before the rotation
@@ -43,9 +43,11 @@ struct VolumeObject {
         const Placement fitted = fitToUnitCube(upright(), fit);
         placement.offset = fitted.toWorld(placement.offset);
         placement.scale = placement.scale * fitted.size();
-        const Vec3 sum = upright().lo + upright().hi;
-        placement.scale = {placement.scale.x, -placement.scale.y, -placement.scale.z};
-        placement.offset = {placement.offset.x, sum.y - placement.offset.y, sum.z - placement.offset.z};
+        if (fit) {
+            const Vec3 sum = upright().lo + upright().hi;
+            placement.scale = {placement.scale.x, -placement.scale.y, -placement.scale.z};
+            placement.offset = {placement.offset.x, sum.y - placement.offset.y, sum.z - placement.offset.z};
+        }
         if (look.isPlaced()) {
             const Vec3 center = upright().center();
             placement.scale = placement.scale * look.scale;
@@ -128,11 +130,15 @@ struct Scene {
         const float slack = static_cast<float>(visible.slack) * object.placement.largest();
         lookAt([&](const auto& take) {
             bool isEmpty = true;
-            for (const Vec3& p : visible.points)
-                if (const float s = static_cast<float>(visible.slack); object.shown.padded(s).overlaps({p, p})) {
-                    take(object.toWorld(clamped(p, object.shown)), slack);
-                    isEmpty = false;
-                }
+            const Box reach = object.shown.padded(static_cast<float>(visible.slack));
+            for (std::size_t i = 0; i + 1 < visible.points.size(); i += 2) { // the ends of a row
+                const Box row{visible.points[i], visible.points[i + 1]};
+                if (!reach.overlaps(row))
+                    continue;
+                for (const Vec3& end : {row.lo, row.hi})
+                    take(object.toWorld(clamped(end, object.shown)), slack);
+                isEmpty = false;
+            }
             if (isEmpty) // the whole
                 for (int i = 0; i < 8; ++i)
                     take(object.toWorld(object.shown.corner(i)), 0);

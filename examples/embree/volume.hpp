@@ -57,7 +57,7 @@ using BoxReader = std::function<void(const Index3& lo, const Index3& hi, std::by
 struct VisibleVoxels {
     // For the camera: the first and last points of rows that stand out from the background, in voxels.
     std::vector<Vec3> points;
-    int slack = 0; // how many voxels beyond these the lattice may have missed
+    int slack = 0; // what is visible ends before so many voxels beyond these
 
     // For the cost: blocks of `width` voxels, x fastest. Each is 1 if something in it has an opacity, otherwise 0.
     Index3 width{}, blocks{};
@@ -236,7 +236,7 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
         return static_cast<std::uint64_t>(1 + (info.dims[axis] - 1) / stride(axis));
     };
     VisibleVoxels visible;
-    visible.slack = std::max({stride(0), stride(1), stride(2)}) - 1;
+    visible.slack = std::max({stride(0), stride(1), stride(2)});
     for (std::size_t axis = 0; axis < 3; ++axis) {
         visible.width[axis] = std::max(skipWidth, stride(axis)); // so that each block has a row or more
         visible.blocks[axis] = 1 + (info.dims[axis] - 1) / visible.width[axis];

@@ -142,6 +142,47 @@ TEST_CASE("Every point of a scene is in the default view", "[framing]")
     }
 }
 
+// A ball of voxels, which shows up to one voxel beyond them.
+TEST_CASE("What a volume shows is in the default view, however small it is or where it is clipped", "[framing]")
+{
+    for (const float radius : {0.5f, 3.2f, 6.0f, 12.0f, 40.0f})
+        for (const bool isClipped : {false, true}) {
+            const int side = radius > 12 ? 100 : 32;
+            const float middle = 0.5f * static_cast<float>(side);
+            const auto isInside = [=](int x, int y, int z) {
+                const Vec3 p{static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)};
+                return example::length(p - Vec3{middle, middle, middle}) < radius;
+            };
+            example::FileLook look;
+            if (isClipped)
+                look.clip = example::Box{{middle, 0, 0}, {100, 100, 100}};
+            Scene scene;
+            scene.add(example::detail::generatedVolume(
+                          {side, side, side}, [=](int x, int y, int z) { return isInside(x, y, z) ? 1.0f : 0.0f; }),
+                      true, look);
+            const example::VolumeObject& object = scene.volumes.front();
+            std::vector<Vec3> points;
+            for (int z = 0; z < side; ++z)
+                for (int y = 0; y < side; ++y)
+                    for (int x = 0; x < side; ++x)
+                        if (isInside(x, y, z))
+                            for (const example::Sphere& corner : corners({0, 0, 0}, {1, 1, 1}, 0)) {
+                                const Vec3 p =
+                                    Vec3{static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)}
+                                    + (corner.center - Vec3{0.5f, 0.5f, 0.5f}) * 1.15f; // 1 in each direction
+                                points.push_back(object.toWorld(clamped(p, object.shown)));
+                            }
+            INFO("radius " << radius << (isClipped ? ", clipped" : ""));
+            for (const float elevation : {20.0f, 90.0f, -35.0f}) {
+                example::RenderSettings settings;
+                settings.width = settings.height = 240;
+                settings.view.elevation = elevation;
+                const auto camera = frameCamera(example::SceneInfo(scene), settings, 0);
+                CHECK(farthestOf(points, camera.pinhole(), settings) < 1.0f);
+            }
+        }
+}
+
 TEST_CASE("No kind of camera cuts off a scene by default", "[framing]")
 {
     for (const auto& [name, scene] : scenes()) {
