@@ -302,12 +302,13 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
     const float opacity = choice.opacity.value_or(1);
     const ColorMap* map = nullptr;
     const TissuePreset* preset = nullptr;
-    const bool isFree = choice.transfer.empty() && !choice.range && choice.isovalues.empty() && !choice.color;
+    const std::string name = choice.transfer == "auto" ? "" : choice.transfer;
+    const bool isFree = name.empty() && !choice.range && choice.isovalues.empty() && !choice.color;
     for (const ColorMap& m : colorMaps())
-        if (m.name == (choice.transfer.empty() ? "ember" : choice.transfer))
+        if (m.name == (name.empty() ? "ember" : name))
             map = &m;
     for (const TissuePreset& p : tissuePresets())
-        if (p.name == choice.transfer)
+        if (p.name == name)
             preset = &p;
     const detail::LatticeRows lattice = detail::readLattice(source, loaders);
     const auto range = shownRange(source, choice, map && map->isDiverging, lattice, loaders);
@@ -332,7 +333,7 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
         });
         // So that e^-2.5 of the light is left on the way through all that is visible.
         look.points = detail::pointsOf(*map, depth > 0 ? std::clamp(2.5 / depth, 0.004, 3.0) : 1.0, opacity, noise);
-        if (choice.color && choice.transfer.empty())
+        if (choice.color && name.empty())
             for (TransferPoint& p : look.points)
                 p = {p.value, choice.color->x, choice.color->y, choice.color->z, p.opacity};
     } else if (preset) {

@@ -144,7 +144,7 @@ inline bool setLook(FileLook& look, const std::string& key, const std::string& v
     } else if (key == "transfer") {
         if (value.empty())
             wrong("a name or a file");
-        look.transfer = value == "auto" ? "" : value;
+        look.transfer = value;
     } else if (key == "range") {
         const std::vector<std::string> ends = detail::splitAt(value, ',');
         std::array<RangeEnd, 2> range;

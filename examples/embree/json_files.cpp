@@ -21,11 +21,11 @@ std::string textOf(const Json& json)
     return json.dump(2, ' ', false, Json::error_handler_t::replace) + '\n'; // file names may have any bytes
 }
 
-// An option's value: a number, true or false if it is one, otherwise a text.
+// An option's value: a number, true or false if it is written like one, otherwise a text.
 Json valueOf(const std::string& text)
 {
     const Json value = Json::parse(text, nullptr, false);
-    return value.is_number() || value.is_boolean() ? value : Json(text);
+    return (value.is_number() || value.is_boolean()) && value.dump() == text ? value : Json(text);
 }
 
 // The `value` of each rank.
@@ -173,6 +173,8 @@ TransferFile parseTransfer(const std::string& text, const std::string& path)
         file.points.push_back(p);
     }
     const Json range = all.contains("range") ? all["range"] : Json();
+    require(range.is_null() || (file.points.front().value >= 0 && file.points.back().value <= 1),
+            "with a 'range', values of points are from 0 to 1: 0 stands for its low end, 1 for its high end");
     if (range.is_null()) {
         file.range = {file.points.front().value, file.points.back().value};
         for (TransferPoint& p : file.points)

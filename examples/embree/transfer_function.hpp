@@ -56,10 +56,10 @@ public:
 
     // `step`: distance between samples in units of 1/256 of the volume's largest extent.
     explicit TransferFunction(float step, const TransferPoints& points = emberPoints())
-        : table_(size + 2), opaqueBefore_(size + 3, 0)
+        : size_(sizeFor(points)), table_(static_cast<std::size_t>(size_) + 2), opaqueBefore_(table_.size() + 1, 0)
     {
         for (std::size_t i = 0; i < table_.size(); ++i) {
-            const TransferPoint p = at(points, std::min(1.0f, static_cast<float>(i) / static_cast<float>(size)));
+            const TransferPoint p = at(points, std::min(1.0f, static_cast<float>(i) / static_cast<float>(size_)));
             table_[i] = {p.r, p.g, p.b, p.opacity > 0 ? 1 - std::pow(1 - p.opacity, step) : 0};
             opaqueBefore_[i + 1] = opaqueBefore_[i] + (table_[i].alpha > 0);
         }
@@ -68,7 +68,7 @@ public:
     // Clamps the value to [0, 1].
     Entry operator()(float value) const
     {
-        const float at = std::clamp(value, 0.0f, 1.0f) * static_cast<float>(size);
+        const float at = std::clamp(value, 0.0f, 1.0f) * static_cast<float>(size_);
         const std::size_t i = static_cast<std::size_t>(at);
         const float f = at - static_cast<float>(i);
         const Entry &a = table_[i], &b = table_[i + 1];
@@ -78,14 +78,24 @@ public:
     // Whether every value in [lo, hi] has opacity 0, with room for the rounding of an interpolated value.
     bool isTransparent(float lo, float hi) const
     {
-        const auto at = [](float value) {
-            return static_cast<std::size_t>(std::clamp(value, 0.0f, 1.0f) * static_cast<float>(size));
+        const auto at = [this](float value) {
+            return static_cast<std::size_t>(std::clamp(value, 0.0f, 1.0f) * static_cast<float>(size_));
         };
         return opaqueBefore_[at(hi + 1e-5f) + 2] == opaqueBefore_[at(lo - 1e-5f)];
     }
 
 private:
-    static constexpr int size = 1024;
+    // Four entries or more between any two points that are not closer than values of 16 bits.
+    static int sizeFor(const TransferPoints& points)
+    {
+        float least = 1;
+        for (std::size_t i = 1; i < points.size(); ++i)
+            if (const float gap = points[i].value - points[i - 1].value; gap > 0)
+                least = std::min(least, gap);
+        return static_cast<int>(std::clamp(4 / least, 1024.0f, 262144.0f));
+    }
+
+    int size_;
     std::vector<Entry> table_;
     std::vector<int> opaqueBefore_; // number of entries before this one with opacity above 0
 };

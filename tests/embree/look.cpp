@@ -161,6 +161,7 @@ TEST_CASE("A run's look holds where a file says nothing", "[look]")
     const FileLook run = lookWith({{"transfer", "grey"}, {"range", "1,2"}, {"clip", "0,0,0,1,1,1"}});
     CHECK(merged({}, run).transfer == "grey");
     CHECK(merged(lookWith({{"transfer", "bone"}}), run).transfer == "bone");
+    CHECK(merged(lookWith({{"transfer", "auto"}}), run).transfer == "auto");
     CHECK(merged(lookWith({{"range", "3,4"}}), run).range->front().value == 3.0f);
     CHECK(merged({}, run).clip);
 }
@@ -207,6 +208,21 @@ TEST_CASE("The opacity of a transfer function is that of a length, whatever the 
     }
 }
 
+TEST_CASE("A transfer function shows a peak as narrow as one value of 16 bits", "[look][transfer]")
+{
+    const auto at = [](float value) { return value / 65535; };
+    const TransferFunction narrow(1, {{0, 1, 1, 1, 0},
+                                      {at(30044), 1, 1, 1, 0},
+                                      {at(30045), 1, 1, 1, 0.5f},
+                                      {at(30046), 1, 1, 1, 0},
+                                      {1, 1, 1, 1, 0}});
+    CHECK(narrow(at(30045)).alpha
+          == Approx(0.5f).epsilon(0.15)); // 4 entries from 0 to 0.5: the peak may be between two
+    CHECK(narrow(at(30040)).alpha == 0.0f);
+    CHECK_FALSE(narrow.isTransparent(at(30045), at(30045)));
+    CHECK(narrow.isTransparent(at(30000), at(30040)));
+}
+
 TEST_CASE("A transfer function is read from JSON", "[look][transfer]")
 {
     const TransferFile data = parseTransfer(
@@ -224,7 +240,9 @@ TEST_CASE("A transfer function is read from JSON", "[look][transfer]")
     for (
         const std::string& wrong : std::vector<std::string>{
             "", "{", "[]", "{}", R"({"points": []})", R"({"points": [1, 2]})", "{\"colour\": 1, " + two + "}",
-            "{\"range\": [9, 5], " + two + "}", "{\"range\": 5, " + two + "}",
+            "{\"range\": [9, 5], " + two + "}",
+            R"({"range": [0, 9], "points": [{"value": 0, "color": [0,0,0], "opacity": 0}, {"value": 9, "color": [0,0,0], "opacity": 1}]})",
+            "{\"range\": 5, " + two + "}",
             R"({"points": [{"value": 1, "color": [0,0,0], "opacity": 0}, {"value": 1, "color": [0,0,0], "opacity": 0}]})",
             R"({"points": [{"value": 0, "color": [0,0,0], "opacity": 0}, {"value": 1, "color": [0,0,2], "opacity": 0}]})",
             R"({"points": [{"value": 0, "color": [0,0,0], "opacity": 0}, {"value": 1, "color": [0,0,1], "opacity": 2}]})",
@@ -574,6 +592,16 @@ TEST_CASE("A turned volume looks as the volume of the turned voxels", "[look]")
 }
 
 // ---- the camera -----------------------------------------------------------------------------------------------------
+
+TEST_CASE("Without fitting, voxels are where their file says", "[look]")
+{
+    example::VolumeSource source = example::detail::generatedVolume({4, 5, 6}, [](int, int, int) { return 1.0f; });
+    source.info.origin = {10, 20, 30};
+    source.info.spacing = {1, 2, 3};
+    const example::VolumeObject object(source, false);
+    CHECK(object.toWorld({0, 0, 0}) == Vec3{10, 20, 30});
+    CHECK(object.toWorld({3, 1, 2}) == Vec3{13, 22, 36});
+}
 
 TEST_CASE("The camera is where it is told to be", "[look][camera]")
 {

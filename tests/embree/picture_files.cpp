@@ -224,6 +224,8 @@ TEST_CASE("The options of a run are read again as they were", "[options][config]
     REQUIRE(off.options);
     CHECK_FALSE(off.options->shadows);
     CHECK(test::contains(optionsText(off.options->scene, off.options->given), "\"shadows\": false"));
+    // A name that reads like a number stays as it is written.
+    CHECK(test::contains(optionsText({"demo"}, {{"aux", "1.10"}, {"spp", "4"}}), "\"aux\": \"1.10\""));
     for (const char* empty : {"{\"spp\": []}", "spp = []\n"}) {
         const ParsedOptions parsed = parse({"demo", "--config", folder.write("empty", empty)});
         INFO(parsed.message);
