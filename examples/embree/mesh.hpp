@@ -107,19 +107,35 @@ inline Vec3d weightedNormal(const Mesh& mesh, const Triangle& t)
     return cross(b - a, c - a);
 }
 
-// Unit vertex normals: the mean normal of the triangles around a vertex, weighted by area; zero if there are none.
+// The normal of a vertex: the mean of those of its triangles, weighted by area.
+class NormalSum {
+public:
+    void add(const Vec3d& weighted)
+    {
+        sum_ = sum_ + weighted;
+        size_ += length(weighted);
+    }
+    // Zero if there are no triangles, or if they cancel out up to rounding, as those of a two-sided sheet do.
+    Vec3 unit() const { return length(sum_) > 1e-9 * size_ ? toFloat(example::unit(sum_)) : Vec3(); }
+
+private:
+    Vec3d sum_{};
+    double size_ = 0;
+};
+
+// The unit normals of all vertices.
 inline std::vector<Vec3> vertexNormals(const Mesh& mesh)
 {
-    std::vector<Vec3d> sums(mesh.positions.size());
+    std::vector<NormalSum> sums(mesh.positions.size());
     for (const Triangle& t : mesh.triangles) {
         const Vec3d normal = weightedNormal(mesh, t);
         for (const std::uint32_t i : t)
-            sums[i] = sums[i] + normal;
+            sums[i].add(normal);
     }
     std::vector<Vec3> normals;
     normals.reserve(sums.size());
-    for (const Vec3d& sum : sums)
-        normals.push_back(toFloat(unit(sum)));
+    for (const NormalSum& sum : sums)
+        normals.push_back(sum.unit());
     return normals;
 }
 

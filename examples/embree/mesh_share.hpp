@@ -217,10 +217,9 @@ inline std::vector<Vec3> normalsOf(const MeshPart& part, const std::vector<std::
         forOthers[r] = ForOne();
     }
     const std::vector<Loaders::Bytes> received = loaders.exchange(std::move(parts));
-    std::vector<Vec3d> sums(static_cast<std::size_t>(begins[rank + 1] - begins[rank]));
+    std::vector<NormalSum> sums(static_cast<std::size_t>(begins[rank + 1] - begins[rank]));
     const auto add = [&](std::uint32_t vertex, const Vec3d& normal) {
-        Vec3d& sum = sums[static_cast<std::size_t>(vertex - begins[rank])];
-        sum = sum + normal;
+        sums[static_cast<std::size_t>(vertex - begins[rank])].add(normal);
     };
     for (std::size_t r = 0; r < ranks; ++r) {
         if (r == rank)
@@ -237,8 +236,8 @@ inline std::vector<Vec3> normalsOf(const MeshPart& part, const std::vector<std::
     }
     std::vector<Vec3> normals;
     normals.reserve(sums.size());
-    for (const Vec3d& sum : sums)
-        normals.push_back(toFloat(unit(sum)));
+    for (const NormalSum& sum : sums)
+        normals.push_back(sum.unit());
     return lookup.of(normals);
 }
 

@@ -359,14 +359,13 @@ void Renderer::march(Ray& ray, Tools& tools) const
                 continue;
             }
             ++ray.cost;
-            const TransferFunction::Entry entry = volume.shade(voxel, ray.direction, tools.light);
-            if (entry.alpha > 0) {
+            const Shaded shaded = volume.shade(voxel, ray.direction, tools.light);
+            if (shaded.alpha > 0) {
                 addHits(t);
                 if (isDone())
                     break;
-                const Vec3 color{entry.r, entry.g, entry.b};
-                ray.albedo = ray.albedo + color * static_cast<float>(ray.through);
-                ray.add(t, color, entry.alpha);
+                ray.albedo = ray.albedo + shaded.albedo * static_cast<float>(ray.through);
+                ray.add(t, shaded.color, shaded.alpha);
             }
         }
     }

@@ -297,7 +297,7 @@ private:
         Hit hit;
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[index];
-        hit.normal = toFloat(unit(normal));
+        hit.normal = toFloat(unit(dot(normal, normal) > 0 ? normal : weightedNormal(part.mesh, triangle)));
         hit.color = colorAt(part, triangle, u, v);
         hit.opacity = part.opacity;
         query.keep(distance, hit, part.clip);
@@ -350,8 +350,8 @@ private:
         bounds.upper_z = sphere.center.z + radius;
     }
 
-    // Records where the ray enters the sphere, or where it leaves if the entry is clipped away. Tells Embree of no hit,
-    // so that it goes on.
+    // Records where the ray enters the sphere, or where it leaves if it begins inside or the entry is clipped away.
+    // Tells Embree of no hit, so that it goes on.
     static void onSphere(const RTCIntersectFunctionNArguments* arguments)
     {
         if (arguments->valid[0] == 0)
@@ -367,7 +367,8 @@ private:
         if (!(rest > 0))
             return;
         const double half = std::sqrt(rest / dd);
-        const double t = query.shows(part.clip, along - half) ? along - half : along + half;
+        const bool enters = along > half && query.shows(part.clip, along - half);
+        const double t = enters ? along - half : along + half;
         Hit hit;
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[arguments->primID];

@@ -7,6 +7,12 @@
 
 namespace example {
 
+// A point of a volume, premultiplied: its colour in the light, and its own colour.
+struct Shaded {
+    Vec3 color, albedo;
+    float alpha = 0;
+};
+
 class VolumeSampler {
     const VolumeInfo& info() const { return volume_.block.info(); }
 
@@ -118,8 +124,8 @@ public:
         return static_cast<int>(std::max(0.0f, steps - 0.05f)) + 1; // 0.05 for rounding
     }
 
-    // Adds the light and returns premultiplied colour and opacity; opacity 0 where there is nothing.
-    TransferFunction::Entry shade(const Vec3& v, const Vec3& view, const Light& light) const
+    // Returns alpha 0 where there is nothing.
+    Shaded shade(const Vec3& v, const Vec3& view, const Light& light) const
     {
         return dispatch([&](const auto* voxels) { return shade(voxels, v, view, light); });
     }
@@ -206,13 +212,15 @@ private:
     }
 
     template <class T>
-    TransferFunction::Entry shade(const T* voxels, const Vec3& v, const Vec3& view, const Light& light) const
+    Shaded shade(const T* voxels, const Vec3& v, const Vec3& view, const Light& light) const
     {
         const Corner<T> at = cornerOf(voxels, v);
         const float z0 = at.before(), z1 = at.behind();
-        TransferFunction::Entry entry = transferFunction_((lerp(z0, z1, at.fz) - look().lo) * valueScale_);
+        const TransferFunction::Entry entry = transferFunction_((lerp(z0, z1, at.fz) - look().lo) * valueScale_);
         if (!(entry.alpha > 0))
             return {};
+        const Vec3 albedo = Vec3{entry.r, entry.g, entry.b} * entry.alpha;
+        Shaded shaded{albedo, albedo, entry.alpha};
         const Vec3 gradient = gradientOf(at, z0, z1);
         const float steepness = length(gradient);
         if (steepness > 0) {
@@ -221,14 +229,10 @@ private:
             const float weight = std::min(1.0f, 25.0f * steepness);
             const float lit = 1 + weight * (light.diffuse(normal) - 1);
             const float highlight = weight * light.specular(normal, view);
-            entry.r = entry.r * lit + highlight;
-            entry.g = entry.g * lit + highlight;
-            entry.b = entry.b * lit + highlight;
+            shaded.color =
+                (Vec3{entry.r, entry.g, entry.b} * lit + Vec3{highlight, highlight, highlight}) * entry.alpha;
         }
-        entry.r *= entry.alpha;
-        entry.g *= entry.alpha;
-        entry.b *= entry.alpha;
-        return entry;
+        return shaded;
     }
 
     std::size_t cellIndex(int x, int y, int z) const

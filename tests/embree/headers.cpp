@@ -341,8 +341,10 @@ TEST_CASE("Voxels that are no cubes have the light and opacity of cubes", "[head
         const auto a = cubes.shade(cubes.toVoxel(p), view, light), b = slabs.shade(slabs.toVoxel(p), view, light);
         CHECK(a.alpha > 0.0f);
         CHECK(std::fabs(a.alpha - b.alpha) < 1e-5f);
-        CHECK(std::fabs(a.r - b.r) + std::fabs(a.g - b.g) + std::fabs(a.b - b.b) < 1e-5f);
-        lit += a.r > 0;
+        CHECK(length(a.color - b.color) < 1e-5f);
+        CHECK(length(a.albedo - b.albedo) < 1e-5f);
+        CHECK(!(a.albedo == a.color)); // it has no light
+        lit += a.color.x > 0;
         CHECK(std::fabs(cubes.toVoxel(p).z - 2 * slabs.toVoxel(p).z) < 1e-4f);
     }
     CHECK(lit == 3);

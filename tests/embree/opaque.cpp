@@ -273,4 +273,34 @@ TEST_CASE("The first hits of a ray are those of all", "[opaque]")
     }
 }
 
+TEST_CASE("A ray that begins in a sphere meets it where it leaves", "[opaque]")
+{
+    const example::Surfaces surfaces(
+        {{-9, -9, -9}, {9, 9, 9}}, {},
+        std::vector<example::BrickSpheres>(1, {0, {{{1, 0, 0}, 2, {1, 1, 1}}}, {0}, {}, {}}));
+    std::vector<example::Hit> hits;
+    surfaces.intersect({0, 0, 0}, {1, 0, 0}, hits);
+    REQUIRE(hits.size() == 1);
+    CHECK(hits[0].t == 3.0f);
+    surfaces.intersect({-1, 0, 0}, {-1, 0, 0}, hits); // on it, and away
+    CHECK(hits.empty());
+}
+
+TEST_CASE("A sheet with two sides, whose normals cancel out, has those of its triangles", "[opaque]")
+{
+    const float third = 1.0f / 3;
+    example::Mesh sheet{{{0, 0, third}, {third, 0, 0}, {0, third, 0}, {third, third, 0.1f}}, {}};
+    sheet.triangles = {{0, 1, 2}, {1, 3, 2}, {2, 1, 0}, {3, 1, 2}};
+    for (const Vec3& normal : vertexNormals(sheet))
+        CHECK(normal == Vec3());
+    Scene scene;
+    scene.add(sheet, false);
+    example::Brick brick = loadBrick(scene, scene.bounds);
+    const example::Surfaces surfaces(scene.bounds, std::move(brick.meshes), std::move(brick.spheres));
+    std::vector<example::Hit> hits;
+    surfaces.intersect({1, 1, 1}, Vec3{-1, -1, -1} + Vec3{0.1f, 0.1f, 0.1f}, hits);
+    REQUIRE(!hits.empty());
+    CHECK(example::length(hits[0].normal) == Approx(1));
+}
+
 } // namespace opaque_cases
