@@ -24,6 +24,8 @@ namespace example {
 
 namespace {
 
+bool isVolumePath(const std::string& path) { return isHdf5(path) || isVolumeEnding(endingOf(path)); }
+
 // The arguments in the order that CLI11 takes: the last one first. A --live without a number gets the port -1, because
 // CLI11 would take a scene that follows for the port.
 std::vector<std::string> withPort(int argc, const char* const* argv)
@@ -353,6 +355,8 @@ private:
                "cost does not go with --blend order");
         refuse(options_.mode != Mode::Image, "--distribution", "needs --mode image");
         refuse(options_.mode != Mode::Image, "--path", "needs --mode image: paths go through the whole scene");
+        for (const char* other : {"--ao", "--ao-distance", "--shadows", "--opacity"})
+            refuse(options_.pathBounces > 0, other, "does not go with --path");
         refuse(!isData, "--interleave", "needs --mode data");
         refuse(!isData, "--deep", "needs --mode data");
         refuse(options_.bricks > mostCells / options_.interleave, "--interleave",
@@ -423,10 +427,9 @@ private:
             } catch (const std::invalid_argument& wrong) {
                 throw CLI::ValidationError("scene", wrong.what());
             }
-            const bool isInHdf5 = isHdf5(file.path);
-            if (const std::string wrong = detail::checkEnding(file.path, endings); !wrong.empty() && !isInHdf5)
+            if (const std::string wrong = detail::checkEnding(file.path, endings); !wrong.empty() && !isHdf5(file.path))
                 throw CLI::ValidationError("scene", wrong + ", or the word synthetic or demo");
-            const bool isVolume = isInHdf5 || isVolumeEnding(endingOf(file.path));
+            const bool isVolume = isVolumePath(file.path);
             if (!isVolume && (!file.look.transfer.empty() || file.look.range || !file.look.isovalues.empty()))
                 throw CLI::ValidationError("scene", "'" + word + "': transfer, range and isovalue are for volumes");
             LookOptions::requireTransfer(file.look.transfer, "scene", "'" + word + "': transfer: ");
@@ -435,8 +438,15 @@ private:
             if (app_.count("--ao") == 0 && !isVolume && options_.pathBounces == 0)
                 options_.aoRays = options_.live ? 4 : 16; // samples accumulate in a live view
         }
-        const bool clips = std::any_of(options_.files.begin(), options_.files.end(),
-                                       [](const SceneFile& file) { return file.look.clip.has_value(); });
+        const auto any = [this](bool (*is)(const SceneFile&)) {
+            return options_.files.empty() || std::any_of(options_.files.begin(), options_.files.end(), is);
+        };
+        const bool clips = any([](const SceneFile& file) { return file.look.clip.has_value(); });
+        const bool hasVolumes = any([](const SceneFile& file) { return isVolumePath(file.path); });
+        const bool hasAtoms = any([](const SceneFile& file) { return endingOf(file.path) == ".xyz"; });
+        for (const char* option : {"--spacing", "--origin"})
+            refuse(!hasVolumes, option, "is for volumes, and there are none");
+        refuse(!hasAtoms, "--xyz-frame", "is for .xyz files, and there are none");
         refuse(options_.fit && !clips, "--origin", "needs --no-fit or --clip: otherwise each file is centred");
     }
 

@@ -235,7 +235,7 @@ TEST_CASE("The camera's place and the look arrive", "[options]")
     CHECK(o.files[1].look.isovalues.empty()); // the file has a look of its own
     CHECK(o.look.isovalues == std::vector<float>{3, 7});
     CHECK(options({"demo", "--up=-z"}).view.up.z == -1.0f);
-    CHECK(options({"demo", "--transfer", "auto"}).look.transfer.empty());
+    CHECK(options({"demo", "--transfer", "auto"}).look.transfer == "auto");
     CHECK(options({"demo", "--transfer", "a/b.json"}).look.transfer == "a/b.json");
     CHECK(options({"demo", "--output", "a.exr"}).layers == dfb::depthChannel);
     CHECK(options({"demo", "--output", "a.exr", "--layers", "none"}).layers == 0);
@@ -292,6 +292,15 @@ TEST_CASE("What would do nothing is refused", "[options]")
     CHECK(test::contains(parsed.message, "--origin: needs --no-fit"));
     CHECK(parse({"a_2x2x2_uint8.raw:clip=0,0,0,1,1,1", "--origin", "1,1,2"}).options);
     CHECK(parse({"a_2x2x2_uint8.raw", "--origin", "1,1,2", "--no-fit"}).options);
+    CHECK_FALSE(parse({"a.ply", "--spacing", "1,1,2"}).options);
+    CHECK_FALSE(parse({"a.ply", "--xyz-frame", "2"}).options);
+    CHECK(parse({"a.ply", "b.xyz", "--xyz-frame", "2"}).options);
+    for (const std::vector<std::string>& other : std::vector<std::vector<std::string>>{
+             {"--ao", "4"}, {"--ao-distance", "1"}, {"--shadows"}, {"--opacity", "0.5"}}) {
+        std::vector<std::string> words = other;
+        words.insert(words.end(), {"--mode", "image", "--path", "2"});
+        checkRefused(words);
+    }
 }
 
 TEST_CASE("Two files with one name are refused", "[options]")
