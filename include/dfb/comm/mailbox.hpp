@@ -88,8 +88,11 @@ public:
     void stop()
     {
         if (!isEnding_ && !failed())
-            for (const int neighbour : treeNeighbours(rank(), size()))
-                sendBody(neighbour, MessageKind::Leaving, epoch_, Leaving{reductionCount_, std::uncaught_exceptions()});
+            orGiveUp([&] {
+                for (const int neighbour : treeNeighbours(rank(), size()))
+                    sendBody(neighbour, MessageKind::Leaving, epoch_,
+                             Leaving{reductionCount_, std::uncaught_exceptions()});
+            });
         connection_->detach(address_);
         std::unique_lock<std::mutex> lock(mutex_);
         isEnding_ = true;
@@ -275,15 +278,10 @@ public:
                             bytesOf(message));
     }
 
-    // A message of rank `source` that needed credit has left the inbox. Ends the connection if there is no memory to
-    // say so, because other ranks may wait for the credit.
+    // A message of rank `source` that needed credit has left the inbox. Other ranks may wait for the credit.
     void consumed(int source, std::size_t byteCount)
     {
-        try {
-            flow_.consumed(source, byteCount);
-        } catch (const std::bad_alloc& e) {
-            giveUp(source, errorInfo(ErrorKind::Transport, e.what()));
-        }
+        orGiveUp([&] { flow_.consumed(source, byteCount); });
     }
 
     // Keeps the error of a message that could not be read. The message may have been for something that this rank has
@@ -305,6 +303,18 @@ public:
         error.rank = rank();
         error.from = source;
         connection_->giveUp(error);
+    }
+
+    // Runs a step for whose messages other ranks wait. If it lacks memory, it ends the connection and returns false.
+    bool orGiveUp(FunctionRef<void()> step)
+    {
+        try {
+            step();
+            return true;
+        } catch (const std::bad_alloc& e) {
+            giveUp(-1, errorInfo(ErrorKind::Transport, e.what()));
+            return false;
+        }
     }
 
     // Makes all threads in wait() check their condition again.

@@ -336,9 +336,11 @@ public:
     {
         try {
             if (!outcome_->failed()) // has no effect if isDone() has let this rank vote
-                outcome_->failWhole(errorInfo(ErrorKind::Cancelled,
-                                              "the frame was left without end(). If by an exception: Frame::guard() "
-                                              "around what throws tells all ranks its text"));
+                outcome_->guarded([&] {
+                    outcome_->failWhole(errorInfo(ErrorKind::Cancelled,
+                                                  "the frame was left without end(). If by an exception: "
+                                                  "Frame::guard() around what throws tells all ranks its text"));
+                });
             end();
         } catch (...) {
             // A FrameError, which says what failWhole() was told, or a TransportError, which the next begin() throws.

@@ -192,20 +192,22 @@ public:
     {
         if (mailbox_.failed() || !frame_.vote([this] { return isDone(); }, [this] { return mayVote(); }))
             return;
-        Verdict mine;
-        mine.terms = terms_;
-        mine.error = frame_.reason();
-        addFigures_(mine);
-        verdictSpan_.emplace(mailbox_.trace(), TraceEvent::Kind::Verdict, frame_.number());
-        if (TraceEvent* event = verdictSpan_->event())
-            event->byteCount = mine.sums.bytesSent;
-        if (terms_.allowPartial)
-            mine.incomplete = tiles_.table().unfinished();
-        mailbox_.reductions().enter(verdictKey(), mine.bytes(), Verdict::combine, [this](const Bytes& result) {
-            verdict_ = Verdict::from(result);
-            verdictSpan_.reset();
-            frame_.decide();
-            mailbox_.notify();
+        mailbox_.orGiveUp([&] {
+            Verdict mine;
+            mine.terms = terms_;
+            mine.error = frame_.reason();
+            addFigures_(mine);
+            verdictSpan_.emplace(mailbox_.trace(), TraceEvent::Kind::Verdict, frame_.number());
+            if (TraceEvent* event = verdictSpan_->event())
+                event->byteCount = mine.sums.bytesSent;
+            if (terms_.allowPartial)
+                mine.incomplete = tiles_.table().unfinished();
+            mailbox_.reductions().enter(verdictKey(), mine.bytes(), Verdict::combine, [this](const Bytes& result) {
+                verdict_ = Verdict::from(result);
+                verdictSpan_.reset();
+                frame_.decide();
+                mailbox_.notify();
+            });
         });
     }
 
@@ -239,12 +241,23 @@ public:
         return givesUpAt_ && now >= *givesUpAt_;
     }
 
-    // After beginEnd(): waits for the verdict of all ranks and closes the frame, also when it throws TransportError.
+    // After beginEnd(): waits for the verdict of all ranks and closes the frame, also when it throws. Throws
+    // TransportError, or std::bad_alloc, which ends the connection.
     Verdict conclude()
     {
-        std::exception_ptr transportError;
+        std::exception_ptr failure;
+        const auto attempt = [&](FunctionRef<void()> step) {
+            try {
+                step();
+            } catch (const TransportError&) {
+                failure = std::current_exception();
+            } catch (const std::bad_alloc& e) {
+                failure = std::current_exception();
+                mailbox_.giveUp(-1, errorInfo(ErrorKind::Transport, e.what()));
+            }
+        };
         Verdict verdict;
-        try {
+        attempt([&] {
             do { // at least once: with Progress::Caller, wait() moves messages that others need
                 mailbox_.wait([this] { return isDecided() || isVerdictInDoubt(); }, nextEvent());
             } while (!isConcluded());
@@ -257,22 +270,22 @@ public:
                 verdict.error->frame = frame_.number();
             if (isPartial(verdict)) // only then do all ranks send theirs
                 waitForFinishedTiles();
-        } catch (const TransportError&) {
-            transportError = std::current_exception();
-        }
+        });
         frame_.close([this] { return mailbox_.executor().help(); });
         verdictSpan_.reset(); // if there is no verdict
-        mailbox_.reductions().forget(AllDeclared, frame_.number());
-        mailbox_.reductions().forget(Quiet, frame_.number());
+        attempt([&] {
+            mailbox_.reductions().forget(AllDeclared, frame_.number());
+            mailbox_.reductions().forget(Quiet, frame_.number());
+        });
         mailbox_.connection().expectMessages(false);
-        lastFailed_ = transportError || verdict.error;
+        lastFailed_ = failure || verdict.error;
         tiles_.gather().closeImage();
-        if (!transportError && isPartial(verdict))
+        if (!failure && isPartial(verdict))
             tiles_.setIncomplete(verdict.incomplete);
         else if (lastFailed_)
             tiles_.gather().invalidate();
-        if (transportError)
-            std::rethrow_exception(transportError);
+        if (failure)
+            std::rethrow_exception(failure);
         return verdict;
     }
 
@@ -287,11 +300,13 @@ private:
 
     void tellOthers(const ErrorInfo& info)
     {
-        Bytes body;
-        put(body, info);
-        for (int other = 0; other < mailbox_.size(); ++other)
-            if (other != mailbox_.rank())
-                mailbox_.send(other, MessageKind::Abort, info.frame, body);
+        mailbox_.orGiveUp([&] {
+            Bytes body;
+            put(body, info);
+            for (int other = 0; other < mailbox_.size(); ++other)
+                if (other != mailbox_.rank())
+                    mailbox_.send(other, MessageKind::Abort, info.frame, body);
+        });
     }
 
     ErrorInfo placed(ErrorInfo info) const

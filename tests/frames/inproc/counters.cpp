@@ -7,10 +7,12 @@
 #include <algorithm>
 #include <array>
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
+#include <exception>
 #include <limits>
 #include <memory>
 #include <mutex>
@@ -34,11 +36,12 @@ namespace {
 
 std::atomic<std::int64_t> allocations{0};
 std::atomic<std::size_t> largestAllocation{std::numeric_limits<std::size_t>::max()}; // larger allocations fail
+thread_local int allocationsUntilFailure = -1; // of this thread: the next but so many fails, once; below 0: none
 
 void* allocate(std::size_t bytes, std::size_t alignment)
 {
     ++allocations;
-    if (bytes > largestAllocation)
+    if (bytes > largestAllocation || (allocationsUntilFailure >= 0 && allocationsUntilFailure-- == 0))
         throw std::bad_alloc();
     void* block = alignment > alignof(std::max_align_t)
                       ? std::aligned_alloc(alignment, (bytes + alignment - 1) / alignment * alignment)
@@ -711,6 +714,46 @@ TEST_CASE("A rank that lacks memory to combine parts of a reduction ends it on e
     CHECK((where != "task" ? texts[0] == "no memory" : texts[0] == texts[1]));
     CHECK(texts[1].find("rank 0") != std::string::npos);
     CHECK(texts[1].find(std::bad_alloc().what()) != std::string::npos);
+}
+
+TEST_CASE("Wherever in a frame a rank's memory fails, no rank waits for it in vain", "[counters]")
+{
+    const int failing = GENERATE(0, 1);
+    bool hasFailed = true;
+    for (int place = 0; hasFailed; ++place) {
+        std::vector<std::string> texts(2);
+        dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+            using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, dfb::InprocTransport>;
+            dfb::FrameBufferConfig config(48, 48);
+            config.executor = std::make_shared<dfb::CallerExecutor>(); // all is done in this thread
+            config.quiet = std::chrono::milliseconds(20);
+            dfb::FrameConfig params;
+            params.timeout = std::chrono::seconds(20);
+            std::string& text = texts[static_cast<std::size_t>(communicator.rank())];
+            dfb::World world;
+            world.add({static_cast<std::uint32_t>(communicator.rank()), {{0, 0, 0}, {1, 1, 1}}});
+            try {
+                Fb fb(communicator, config);
+                if (fb.rank() == failing)
+                    allocationsUntilFailure = place;
+                dfb::DataParallelLoop(fb, world).render(
+                    WholeImage(), [](const dfb::Brick&, auto& tile) { tile.color[3] = 1; }, params);
+                text = "fine";
+            } catch (const std::exception& e) {
+                text = e.what();
+            }
+            if (communicator.rank() == failing) {
+                hasFailed = allocationsUntilFailure < 0;
+                allocationsUntilFailure = -1;
+            }
+        });
+        INFO("rank " << failing << ", allocation " << place << ": " << texts[0] << "; " << texts[1]);
+        for (const std::string& text : texts) {
+            CHECK(text.find("timed out") == std::string::npos);
+            CHECK(text.find("not all ranks have ended") == std::string::npos);
+        }
+        CHECK(place < 1000);
+    }
 }
 
 TEST_CASE("What is too large for memory is named with its bytes and its rank, on every rank", "[counters]")
