@@ -240,7 +240,7 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         try {
             const auto thread = threads_.emplace(std::this_thread::get_id(), static_cast<int>(threads_.size()));
-            if (records_.size() < capacity_) {
+            if (records_.size() < capacity_ + room_) {
                 records_.push_back({event, thread.first->second});
                 return;
             }
@@ -258,7 +258,7 @@ public:
     {
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            capacity_ = std::max(capacity_, records_.size() + 10'000); // room for the events of this call
+            room_ = 10'000;
         }
         constexpr int rounds = 20; // of messages to compare clocks by: the quickest ones tell most
         for (int round = 0; round < rounds; ++round)
@@ -290,6 +290,7 @@ private:
         std::copy_n(records, bytes.size() - sizeof dropped_, detail::storeAll(bytes.data(), dropped_));
         dropped_ = 0;
         records_.clear();
+        room_ = 0;
         return bytes;
     }
 
@@ -308,7 +309,8 @@ private:
     }
 
     std::mutex mutex_;
-    std::size_t capacity_;
+    const std::size_t capacity_;
+    std::size_t room_ = 0; // for the events of a call of write()
     std::vector<detail::TraceRecord> records_;
     std::map<std::thread::id, int> threads_;
     std::int64_t dropped_ = 0;
