@@ -309,7 +309,14 @@ int dfb_create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer*
         if (communicator == MPI_COMM_NULL)
             refuse("the communicator is MPI_COMM_NULL");
         connection = dfb::connect(communicator);
-        made = std::make_unique<dfb_framebuffer>(connection, config, framebuffer != nullptr);
+        try {
+            made = std::make_unique<dfb_framebuffer>(connection, config, framebuffer != nullptr);
+        } catch (const dfb::Error&) {
+            throw;
+        } catch (const std::exception& e) { // on this rank alone: the others would wait for it
+            connection->giveUp(dfb::detail::errorInfo(dfb::ErrorKind::Transport, e.what(), connection->rank()));
+            throw;
+        }
     });
     if (framebuffer)
         *framebuffer = made.release();
@@ -406,12 +413,17 @@ int dfb_render(dfb_framebuffer* framebuffer, const dfb_brick* bricks, int count,
             wrong = std::current_exception();
         }
         const auto render = [&](auto& bricksOfAll) {
+            std::optional<decltype(dfb::DataParallelLoop(bricksOfAll, scene->world))> loop;
+            try {
+                if (!wrong)
+                    loop.emplace(bricksOfAll, scene->world);
+            } catch (...) {
+                wrong = std::current_exception();
+            }
             if (!wrong)
-                return dfb::DataParallelLoop(bricksOfAll, scene->world)
-                    .render(
-                        *camera,
-                        [&](const dfb::Brick& brick, auto& tile) { (*scene)(brick, tile, bricksOfAll.layout()); },
-                        fb.frame);
+                return loop->render(
+                    *camera, [&](const dfb::Brick& brick, auto& tile) { (*scene)(brick, tile, bricksOfAll.layout()); },
+                    fb.frame);
             dfb::FrameConfig frame = fb.frame;
             frame.declared = true; // as in the loop that the other ranks are in
             auto open = bricksOfAll.begin(frame);

@@ -142,6 +142,10 @@ program heat_equation
   steps = argument(1, 800)
   every = argument(2, 200)
   call MPI_Init(error)
+  if (min(steps, every) < 1) then
+    print '(a)', 'heat: STEPS and EVERY must be numbers of 1 or more'
+    call MPI_Abort(MPI_COMM_WORLD, 2, error)
+  end if
   call dfb_config_init(config, width, height)
   config%blend = DFB_NEAREST
   config%background = [0.01, 0.012, 0.02, 1.0]
@@ -161,7 +165,7 @@ program heat_equation
     end if
   end do
 
-  if (dfb_is_display_rank(fb)) then
+  if (dfb_is_display_rank(fb) .and. steps >= every) then
     call require(dfb_get_report(fb, report))
     print '(a, i0, a, f0.2, a)', 'the last picture: ', report%tiles_touched, ' tiles, ', report%total_ms, ' ms'
   end if
@@ -181,9 +185,11 @@ contains
   integer function argument(place, usual)
     integer, intent(in) :: place, usual
     character(len=12) :: text
+    integer :: wrong
     argument = usual
     if (command_argument_count() < place) return
     call get_command_argument(place, text)
-    read (text, *) argument
+    read (text, *, iostat=wrong) argument
+    if (wrong /= 0) argument = 0
   end function
 end program
