@@ -58,11 +58,11 @@ std::shared_ptr<dfb::Connection> connectRanks(MPI_Comm communicator)
 }
 
 // A rank with one processor composites in the thread that waits, and makes no threads.
-std::shared_ptr<dfb::Executor> makeExecutor(const dfb::Connection& connection)
+std::shared_ptr<dfb::Executor> makeExecutor(dfb::Connection& connection)
 {
     if (connection.threadShare() == 1)
         return std::make_shared<dfb::CallerExecutor>();
-    return std::make_shared<dfb::ThreadExecutor>(connection.threadShare());
+    return dfb::detail::makeThreads(connection);
 }
 
 } // namespace
@@ -168,6 +168,8 @@ extern "C" void icetSetContext(IceTContext context)
     guarded("icetSetContext", [&] {
         if (context)
             requireThere(context);
+        if (current)
+            requireNotDrawing(*current);
         current = context;
     });
 }
@@ -203,10 +205,10 @@ extern "C" IceTBoolean icetGLIsInitialized() { return current && current->hasGl 
 } // namespace dfb_icet
 
 IceTContextStruct::IceTContextStruct(MPI_Comm communicator)
-    : connection(dfb_icet::connectRanks(communicator)), executor(dfb_icet::makeExecutor(*connection)),
-      ownRank(connection->rank())
+    : connection(dfb_icet::connectRanks(communicator)), ownRank(connection->rank())
 {
     MPI_Comm_dup(communicator, &comm);
+    executor = dfb_icet::makeExecutor(*connection); // if this rank can make none, no other rank waits for it
     order.resize(static_cast<std::size_t>(connection->size()));
     std::iota(order.begin(), order.end(), 0);
     replicas = {ownRank};
