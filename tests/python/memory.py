@@ -166,6 +166,41 @@ class Memory(unittest.TestCase):
         gc.collect()
         self.assertIsNone(alive())
 
+    def test_an_operation_that_refers_to_its_framebuffer_is_released(self):
+        import weakref
+
+        class Owner:
+            def mix(self, inputs):
+                return inputs[0].rgba
+
+        owner = Owner()
+        owner.fb = dfb.FrameBuffer(None, WIDTH, HEIGHT, owner.mix)
+        owner.fb.render([EVERYWHERE], CAMERA, fill(1))
+        owner.fb.close()
+        alive = weakref.ref(owner)
+        del owner
+        gc.collect()
+        self.assertIsNone(alive())
+
+    def test_a_failed_frame_keeps_nothing_of_its_renderer(self):
+        import weakref
+
+        class Local:
+            pass
+
+        seen = []
+
+        def draw(brick, tile):
+            local = Local()
+            seen.append(weakref.ref(local))
+            raise ValueError("no")
+
+        for operation in ("alpha", lambda inputs: inputs[0].rgba):
+            with dfb.FrameBuffer(None, WIDTH, HEIGHT, operation) as fb:
+                error_of(lambda: fb.render([EVERYWHERE], CAMERA, draw))
+                gc.collect()
+                self.assertTrue(seen and all(local() is None for local in seen))
+
 
 if __name__ == "__main__":
     unittest.main()

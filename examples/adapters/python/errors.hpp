@@ -10,6 +10,7 @@
 #include <memory>
 #include <stdexcept>
 #include <string>
+#include <utility>
 
 namespace dfb_python {
 
@@ -94,7 +95,8 @@ public:
         if (first_.is_none())
             first_ = exception;
     }
-    const py::object& first() const noexcept { return first_; }
+    // Returns it and forgets it, so that it does not keep its frames alive.
+    py::object take() noexcept { return std::exchange(first_, py::none()); }
 
 private:
     Cause() = default;
@@ -136,13 +138,13 @@ void withPython(Cause& cause, const Body& body)
 // exception of the callback that threw on this rank. A callback's KeyboardInterrupt or SystemExit is thrown as it is,
 // because these must also end a program that goes on after errors.
 template <class Body>
-auto withoutGil(const Cause& cause, const Body& body)
+auto withoutGil(Cause& cause, const Body& body)
 {
     try {
         const py::gil_scoped_release released;
         return body();
     } catch (const dfb::Error& error) {
-        const py::object& first = cause.first();
+        const py::object first = cause.take();
         if (first.is_none() || PyObject_IsInstance(first.ptr(), PyExc_Exception) == 1)
             setError(error, first);
         else

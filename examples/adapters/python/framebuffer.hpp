@@ -53,6 +53,8 @@ public:
     // Replaces render() on a rank that cannot take part. Throws on all ranks.
     virtual dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame,
                                   const NumpyOperation::FrameData& data) = 0;
+
+    std::shared_ptr<py::object> function; // the operation, if it is a function of Python
 };
 
 template <class TileOp>
@@ -133,6 +135,14 @@ struct FrameBufferSettings : Settings {
 
     std::unique_ptr<AnyFrameBuffer> make(std::shared_ptr<dfb::Connection>&& connection) const
     {
+        auto made = makeWith(std::move(connection));
+        made->function = function;
+        return made;
+    }
+
+private:
+    std::unique_ptr<AnyFrameBuffer> makeWith(std::shared_ptr<dfb::Connection>&& connection) const
+    {
         switch (blend) {
         case Blend::Nearest: return std::make_unique<FrameBufferOf<blend::nearest>>(std::move(connection), config);
         case Blend::Function: return std::make_unique<FrameBufferOf<blend::function>>(std::move(connection), config);
@@ -145,10 +155,9 @@ struct FrameBufferSettings : Settings {
 class FrameBuffer : public Collective<AnyFrameBuffer> {
 public:
     FrameBuffer(const py::object& comm, const FrameBufferSettings& settings)
-        : Collective(
-            comm, settings,
-            [&](std::shared_ptr<dfb::Connection>&& connection) { return settings.make(std::move(connection)); }),
-          function_(settings.function)
+        : Collective(comm, settings, [&](std::shared_ptr<dfb::Connection>&& connection) {
+              return settings.make(std::move(connection));
+          })
     {
     }
 
@@ -170,7 +179,7 @@ public:
             if (!PyCallable_Check(draw.ptr()))
                 throw dfb::InvalidArgument("the renderer is " + shown(draw) + ": it must be a function");
         });
-        const NumpyOperation::FrameData data{function_, cause};
+        const NumpyOperation::FrameData data{object().function, cause};
         const auto& picture = object().config().image;
         const RenderBrick render = [&](const dfb::Brick& brick, RenderTile& tile) {
             withPython(*cause, [&] {
@@ -195,7 +204,7 @@ public:
         const Use use(*this);
         const auto cause = Cause::make();
         withoutGil(*cause, [&] {
-            object().fail(std::make_exception_ptr(std::runtime_error(why)), frame(), {function_, cause});
+            object().fail(std::make_exception_ptr(std::runtime_error(why)), frame(), {object().function, cause});
         });
     }
 
@@ -233,8 +242,6 @@ private:
         throw dfb::InvalidArgument("the camera is " + shown(camera)
                                    + ": it must be a dfb.PerspectiveCamera or a dfb.MatrixCamera");
     }
-
-    std::shared_ptr<py::object> function_; // the operation, if it is a function of Python
 };
 
 } // namespace dfb_python

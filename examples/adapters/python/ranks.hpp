@@ -79,7 +79,7 @@ inline py::list runRanks(int count, const py::object& body)
             withPython(*cause, [&] { results[static_cast<std::size_t>(communicator.rank())] = body(communicator); });
         });
     } catch (...) {
-        const py::object& first = cause->first();
+        const py::object first = cause->take();
         if (first.is_none())
             throw;
         setAgain(first);
