@@ -546,7 +546,7 @@ std::string run(MPI_Comm comm, const Options& options)
 }
 
 int main(int argc, char** argv)
-{
+try {
     dfb::MpiSession mpi(argc, argv);
     // MPI_COMM_WORLD may hold several runs of this program: `mpirun -n 2 in_situ --out a : -n 2 in_situ --out b` runs
     // two simulations. Each gets a communicator and a framebuffer of its own.
@@ -573,4 +573,7 @@ int main(int argc, char** argv)
         std::cerr << "in_situ: " << error << '\n';
     MPI_Comm_free(&comm);
     return error.empty() ? 0 : code;
+} catch (const std::exception& e) {
+    std::cerr << "in_situ: " << e.what() << '\n';
+    return 1;
 }
