@@ -16,6 +16,7 @@
 #include <exception>
 #include <functional>
 #include <memory>
+#include <new>
 #include <optional>
 #include <string>
 #include <type_traits>
@@ -83,8 +84,13 @@ public:
     dfb::FrameReport render(const dfb::World& world, const AnyCamera& camera, const RenderBrick& draw,
                             const dfb::FrameConfig& frame, const NumpyOperation::FrameData& data) override
     {
-        dfb::DataParallelLoop loop(inner_, world);
-        return std::visit([&](const auto& seen) { return loop.render(seen, draw, frame, own(data)); }, camera);
+        std::optional<dfb::DataParallelLoop<Inner>> loop;
+        try {
+            loop.emplace(inner_, world);
+        } catch (const std::bad_alloc&) { // on this rank alone
+            return fail(std::current_exception(), frame, data);
+        }
+        return std::visit([&](const auto& seen) { return loop->render(seen, draw, frame, own(data)); }, camera);
     }
 
     dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame,
