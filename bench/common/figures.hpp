@@ -156,4 +156,15 @@ private:
     std::vector<std::vector<std::string>> rows_;
 };
 
+// The largest difference of two images; NaN if one of the differences is; 0 where there are none.
+inline double differenceOf(const float* a, const float* b, std::size_t values)
+{
+    double largest = 0;
+    for (std::size_t i = 0; a && b && i < values && !std::isnan(largest); ++i) {
+        const double d = std::abs(static_cast<double>(a[i]) - static_cast<double>(b[i]));
+        largest = d <= largest ? largest : d;
+    }
+    return largest;
+}
+
 } // namespace bench

@@ -28,8 +28,9 @@ inline std::vector<std::string> partsOf(const std::string& text, char separator)
 inline bool readSize(const std::string& text, int& width, int& height)
 {
     int end = 0;
-    return std::sscanf(text.c_str(), "%dx%d%n", &width, &height, &end) == 2 && text[static_cast<std::size_t>(end)] == 0
-           && width >= 16 && height >= 16;
+    return text.size() < 12 && std::sscanf(text.c_str(), "%dx%d%n", &width, &height, &end) == 2
+           && text[static_cast<std::size_t>(end)] == 0 && width >= 16 && height >= 16 && width <= 65536
+           && height <= 65536;
 }
 
 // A reader of "1024x768,..." into `sizes`.
@@ -76,6 +77,18 @@ std::function<bool(const std::string&)> readNumber(Number& to, int least)
         const long n = std::strtol(value.c_str(), &end, 10);
         to = static_cast<Number>(n);
         return *end == 0 && !value.empty() && n >= least && n < 1000000000;
+    };
+}
+
+// A reader of "1,2,8" into `numbers`, each from `least` to `most`.
+inline std::function<bool(const std::string&)> readNumbers(std::vector<int>& numbers, int least, int most)
+{
+    return [&numbers, least, most](const std::string& value) {
+        numbers.clear();
+        for (const std::string& part : partsOf(value, ','))
+            if (!readNumber(numbers.emplace_back(), least)(part) || numbers.back() > most)
+                return false;
+        return !numbers.empty();
     };
 }
 

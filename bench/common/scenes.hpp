@@ -31,7 +31,7 @@ private:
     static std::array<double, 4> numbersOf(int rank, int column, int row)
     {
         std::array<double, 4> numbers{};
-        auto h = static_cast<std::uint64_t>(((rank + 1) * 4099 + column) * 4099 + row);
+        auto h = static_cast<std::uint64_t>(((rank + std::int64_t{1}) * 4099 + column) * 4099 + row);
         for (double& number : numbers) {
             h += 0x9e3779b97f4a7c15u;
             std::uint64_t mixed = (h ^ h >> 30) * 0xbf58476d1ce4e5b9u;

@@ -24,6 +24,7 @@
 #include <cstring>
 #include <functional>
 #include <memory>
+#include <stdexcept>
 #include <string>
 #include <utility>
 #include <vector>
@@ -107,6 +108,8 @@ inline void keepWanted(std::vector<System>& systems, const std::string& only)
 {
     const auto isUnwanted = [&](const System& s) { return !isWanted(s.title(), only); };
     systems.erase(std::remove_if(systems.begin(), systems.end(), isUnwanted), systems.end());
+    if (systems.empty())
+        throw std::runtime_error("--only: no system's title has '" + only + "'");
 }
 
 // ---- dfb: an ImageCompositor, or a framebuffer whose renderer shows it images that are ready, tile by tile
@@ -581,7 +584,8 @@ inline void takeErrorsOfFloats(std::vector<System>& systems)
 {
     for (System& s : systems)
         for (const System& f : systems)
-            if (!s.isFloat() && f.isFloat() && s.name == f.name && s.config == f.config) {
+            if (!s.isFloat() && f.isFloat() && s.name == f.name && s.config == f.config
+                && s.config.find("half a level") == std::string::npos) { // which leaves floats as they are
                 s.result.maxError = f.result.maxError;
                 s.result.rmse = f.result.rmse;
             }

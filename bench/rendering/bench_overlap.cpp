@@ -50,15 +50,6 @@ Row rowOf(const MarchedSystem& s, const MarchedSystem& alone)
             figure([](const Times& t, const Times& without) { return t.cpu - without.cpu; })};
 }
 
-// The largest difference of two images; 0 where there are none.
-double differenceOf(const float* a, const float* b, std::size_t values)
-{
-    double largest = 0;
-    for (std::size_t i = 0; a && b && i < values; ++i)
-        largest = std::max(largest, std::abs(static_cast<double>(a[i]) - static_cast<double>(b[i])));
-    return largest;
-}
-
 // Images of one size.
 class Bench {
 public:
@@ -87,7 +78,9 @@ public:
         for (std::size_t v = 0; v <= views; ++v) { // the first touches memory
             takeTurns(timer, systems, v, bricks.views()[v % views]);
             if (systems.size() > 2)
-                largest = std::max(largest, differenceOf(systems[1].image(), systems.back().image(), values));
+                if (const double d = bench::differenceOf(systems[1].image(), systems.back().image(), values);
+                    !(d <= largest))
+                    largest = std::isnan(largest) ? largest : d;
         }
         std::vector<std::array<double, 2>> traffic; // bytes and messages, of the last frame
         for (const MarchedSystem& s : systems)

@@ -717,13 +717,6 @@ std::function<bool(const std::string&)> readNetwork(Network& n)
 Options optionsOf(int argc, char** argv)
 {
     Options o;
-    const auto readRanks = [&](const std::string& value) {
-        o.ranks.clear();
-        for (const std::string& part : bench::partsOf(value, ','))
-            o.ranks.push_back(std::atoi(part.c_str()));
-        return !o.ranks.empty()
-               && std::all_of(o.ranks.begin(), o.ranks.end(), [](int n) { return n >= 2 && n <= 4096; });
-    };
     const auto readScenes = [&](const std::string& value) {
         o.scenes = bench::partsOf(value, ',');
         return std::all_of(o.scenes.begin(), o.scenes.end(),
@@ -742,7 +735,7 @@ Options optionsOf(int argc, char** argv)
         "and\n"
         "                ns a byte\n"
         "  --pixel-ns    processor time of an active pixel, in ns, with dfb and with plain loops",
-        {{"--ranks", readRanks},
+        {{"--ranks", bench::readNumbers(o.ranks, 2, 4096)},
          {"--size", readSize},
          {"--scenes", readScenes},
          {"--frames", bench::readNumber(o.frames, 1)},
