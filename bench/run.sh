@@ -11,8 +11,8 @@ root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
 frames=41 compositing_frames=11 views=12 skip_size=4096x4096 paper_views=8 paper_sizes=256x256,512x512 quick=
 launcher=
-# The fastest variants of each system
-main_rows="limit|defaults|in order, float32, to|in order, float32, all in place|in order, bytes, all in place|in order, unorm8|direct|sequential, radix-k,|sequential, tree"
+# The fastest variants of each system, and those that sort by depth
+main_rows="limit|defaults|dfb: float32, to|dfb: float32, all in place|in order, float32, to|in order, float32, all in place|in order, bytes, all in place|in order, unorm8|direct|sequential, radix-k|sequential, tree|sequential, binary swap|reduce, radix-kr"
 while [ $# -gt 0 ]; do
     case $1 in
     --quick)
