@@ -491,7 +491,7 @@ struct Options {
     // Those that the scripts of ATLAHS (github.com/spcl/atlahs) give to LogGOPSim for links of 200 Gbit/s.
     Network hpc{"hpc", 3.7, 0.2, 0.005, 0.04e-3};
     // CPU time of bench_compositing, 4 ranks, bricks, to 8 bit, by the pixels that are worked on: float32, and radix-k.
-    PixelCosts costs{13, 7};
+    PixelCosts costs{4.1, 7};
     std::string json, svg, table, trace, commit;
 };
 
