@@ -8,6 +8,13 @@
 # missing.
 set -eu
 with=${1:-}
+case $#:$with in
+0: | 1:clang | 1:bench | 1:tests | 1:browser | 1:aarch64) ;;
+*)
+    echo "usage: sh cmake/install_packages.sh [clang|bench|tests|browser|aarch64]" >&2
+    exit 2
+    ;;
+esac
 
 have() {
     command -v "$1" >/dev/null 2>&1
@@ -126,5 +133,9 @@ if ! apt install --no-install-recommends $missing; then
             say "this system has no package $package"
         fi
     done
-    [ -z "$known" ] || apt install --no-install-recommends $known
+    if [ -z "$known" ]; then
+        say "nothing could be installed"
+        exit 1
+    fi
+    apt install --no-install-recommends $known
 fi

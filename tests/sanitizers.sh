@@ -22,19 +22,18 @@ fi
 jobs=$(sh cmake/jobs.sh)
 [ $# -gt 0 ] || set -- asan tsan clang
 
-# All test programs except that of guard.odr, which runs nothing and takes long to compile. A test without its program
-# fails.
+# All test programs except those of guards, which the presets leave out. A test without its program fails.
 run() {
     cmake --preset "$1" || return
-    without='^test_odr$' tests='^$' test_preset=$1 long='stress[.]|unit[.]flow_control$'
+    without='^test_(odr|documented)$' tests='^$' test_preset=$1 long='stress[.]|unit[.]flow_control$'
     if [ "$1" = asan ] && [ $brief = yes ]; then
-        without='^test_(odr|inproc|conformance|stress|skip|scaling|isa_[a-z_]+)$'
+        without='^test_(odr|documented|inproc|conformance|stress|skip|scaling|isa_[a-z_]+)$'
         tests="^($long|unit[.]cameras\$|(inproc|conformance)[.]|(mpi|conformance_mpi)[.][a-z_]+[.]np[27]\$)"
         test_preset=asan-brief
     elif [ "$1" = tsan ] && [ $brief = yes ]; then
         fuzz='control|finished|fragment|packet|readers|tracker'
         unit='blend_kernels|dependency_tracker|fragment_message|levels|quiescence|sparse_planes|tile_ops|visibility|wire_format'
-        without="^test_(odr|stress|skip|scaling|isa_[a-z_]+|fuzz_($fuzz))\$"
+        without="^test_(odr|documented|stress|skip|scaling|isa_[a-z_]+|fuzz_($fuzz))\$"
         tests="^($long|unit[.]($unit)\$|fuzz[.]($fuzz)\$)" test_preset=tsan-brief
     fi
     targets=$(cmake --build --preset "$1" --target help | sed -nE 's/^((test|mpi)_[a-z_]+): phony$/\1/p' |

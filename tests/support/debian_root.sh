@@ -31,6 +31,7 @@ read_options() {
             /*) path=$2 ;;
             *) path=$PWD/$2 ;;
             esac
+            path=${path%/}
             [ "$1" = --root ] && root=$path || output=$path
             shift 2
             ;;
