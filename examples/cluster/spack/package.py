@@ -2,7 +2,7 @@
 #
 #     spack repo create ~/spack-dfb dfb_repo && spack repo add ~/spack-dfb/spack_repo/dfb_repo
 #     mkdir -p ~/spack-dfb/spack_repo/dfb_repo/packages/dfb && cp package.py $_
-#     spack install dfb ^mpich
+#     spack install dfb@main ^mpich     (or dfb@0.2.0, if your copy has that tag)
 #
 # `git` is the place of your copy: with a folder, file:///home/me/dfb.
 
