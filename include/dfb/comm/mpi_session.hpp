@@ -147,7 +147,7 @@ DFB_COMPILED_ONCE void MpiSession::partFromAll()
     check(MPI_Ibarrier(comm, &request), "MPI_Ibarrier");
     detail::waitMpi(request, rank_);
     MPI_Comm_free(&comm);
-    std::this_thread::sleep_for(std::chrono::milliseconds(20));
+    std::this_thread::sleep_for(std::chrono::milliseconds(50)); // longer than ranks come after each other
 #endif
 }
 #endif
