@@ -305,15 +305,12 @@ public:
         connection_->giveUp(error);
     }
 
-    // Runs a step for whose messages other ranks wait. If it lacks memory, it ends the connection and returns false.
-    bool orGiveUp(FunctionRef<void()> step)
+    // As makePart(), but throws nothing if memory is lacking: the connection has failed, which all calls notice.
+    void orGiveUp(FunctionRef<void()> step)
     {
         try {
-            step();
-            return true;
-        } catch (const std::bad_alloc& e) {
-            giveUp(-1, errorInfo(ErrorKind::Transport, e.what()));
-            return false;
+            makePart(step);
+        } catch (const std::bad_alloc&) {
         }
     }
 
@@ -465,8 +462,8 @@ public:
         return result;
     }
 
-    // Calls make(), which makes or adds this rank's part of a collective call. If it lacks memory, the connection fails
-    // on all ranks, as the others would wait for the part; and this throws std::bad_alloc.
+    // Calls make(), which makes or sends this rank's part of what others wait for. If it lacks memory, the connection
+    // fails on all ranks, and this throws std::bad_alloc.
     void makePart(FunctionRef<void()> make)
     {
         try {

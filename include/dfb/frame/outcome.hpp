@@ -248,12 +248,11 @@ public:
         std::exception_ptr failure;
         const auto attempt = [&](FunctionRef<void()> step) {
             try {
-                step();
+                mailbox_.makePart(step);
             } catch (const TransportError&) {
                 failure = std::current_exception();
-            } catch (const std::bad_alloc& e) {
+            } catch (const std::bad_alloc&) {
                 failure = std::current_exception();
-                mailbox_.giveUp(-1, errorInfo(ErrorKind::Transport, e.what()));
             }
         };
         Verdict verdict;
