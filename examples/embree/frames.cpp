@@ -56,19 +56,7 @@ public:
         }
     }
 
-    int rank() const override { return fb_->rank(); }
-    int size() const override { return fb_->size(); }
-    const dfb::FrameBufferConfig& config() const override { return fb_->config(); }
-    const dfb::TileLayout& layout() const override { return fb_->layout(); }
-    const dfb::Image& image() const override { return fb_->image(); }
-    std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, dfb::Reduce how) override
-    {
-        return fb_->allReduce(values, how);
-    }
-    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call) override
-    {
-        return fb_->allGather(bytes, call);
-    }
+    dfb::FrameBufferBase& framebuffer() override { return *fb_; }
     const dfb::DisplayWall* wall() const override { return wall_.get(); }
 
     void start(int frame, const RankWork& work, const dfb::FrameConfig& params) override
@@ -76,7 +64,7 @@ public:
         open_.push_back(render(frame, work, params));
     }
     int openCount() const override { return static_cast<int>(open_.size()); }
-    void addFigure(std::uint64_t key, double value) override { open_.front().addFigure(key, value); }
+    dfb::FrameBase& oldest() override { return open_.front(); }
 
     dfb::FrameReport end() override
     {

@@ -41,7 +41,7 @@ public:
         if (!o.trace.empty())
             config.trace = trace_ = std::make_shared<dfb::TraceFile>();
         try {
-            fb_ = makeFrames(connection, o_, config, verification_);
+            run_ = makeFrames(connection, o_, config, verification_);
         } catch (const dfb::InvalidArgument&) {
             // All ranks throw it, so the connection ends here. One that ends during an exception tells the others that
             // it failed.
@@ -54,7 +54,7 @@ public:
     int run()
     {
         if (!onAllRanks([&] {
-                if (fb_->isDisplayRank())
+                if (fb().isDisplayRank())
                     files_.requireWritable();
             }))
             return exitFailed;
@@ -62,15 +62,15 @@ public:
         if (!onAllRanks([&] { load(); }))
             return exitFailed;
         for (const std::string& note : work_.scene->notes)
-            if (fb_->isDisplayRank())
+            if (fb().isDisplayRank())
                 std::fprintf(stderr, "dfb_render: %s\n", note.c_str());
-        ProgressLine progress(fb_->isDisplayRank(), o_.frames);
+        ProgressLine progress(fb().isDisplayRank(), o_.frames);
         prepare(progress);
         const auto begin = std::chrono::steady_clock::now();
         try {
             renderFrames(progress);
         } catch (const CannotWrite&) { // on all ranks; finish() says why
-            fb_->leaveAll();
+            run_->leaveAll();
         }
         runMs_ = std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - begin).count();
         progress.end();
@@ -78,6 +78,8 @@ public:
     }
 
 private:
+    dfb::FrameBufferBase& fb() const { return run_->framebuffer(); }
+
     // A rank could not write a file of an earlier frame. Thrown on all ranks at the end of the same frame.
     struct CannotWrite {};
     // The key of Frame::addFigure() that tells the others. No brick or tile has it.
@@ -87,7 +89,7 @@ private:
     template <class Step>
     bool onAllRanks(const Step& step)
     {
-        return example::onAllRanks(*fb_, [&] {
+        return example::onAllRanks(fb(), [&] {
             struct AtEnd {
                 PhaseClock& clock;
                 ~AtEnd() { clock.enter(Phase::Compositing); }
@@ -98,7 +100,7 @@ private:
 
     void load()
     {
-        const Loaders loaders = loadersOf(*fb_);
+        const Loaders loaders = loadersOf(fb());
         work_.scene = std::make_unique<RankScene>(loadRankScene(o_, loaders));
         o_.view = work_.scene->view;
         bytesRead_ = loaders.bytesRead();
@@ -109,7 +111,7 @@ private:
         work_.settings = o_;
         work_.world = worldOf(*work_.scene);
         if (o_.mode != Mode::Image)
-            work_.shared.emplace(*fb_, work_.world);
+            work_.shared.emplace(fb(), work_.world);
         work_.tileDone = [this, &progress](std::int64_t work) {
             ++tiles_;
             workDone_ += work;
@@ -128,10 +130,10 @@ private:
     {
         clock_.enter(Phase::Write);
         try {
-            if (writeError_.empty() && fb_->wall())
-                files_.write(frame, *fb_->wall(), fb_->rank());
-            else if (writeError_.empty() && fb_->isDisplayRank())
-                files_.write(frame, fb_->image());
+            if (writeError_.empty() && run_->wall())
+                files_.write(frame, *run_->wall(), fb().rank());
+            else if (writeError_.empty() && fb().isDisplayRank())
+                files_.write(frame, fb().image());
         } catch (const std::exception& e) {
             writeError_ = e.what();
         }
@@ -148,14 +150,14 @@ private:
                 reports_.push_back(renderAdaptively(frame));
                 writeFrame(frame);
             } else {
-                if (fb_->openCount() == fb_->config().framesInFlight)
+                if (run_->openCount() == fb().config().framesInFlight)
                     endFirst();
                 start(frame, params_);
             }
             frames_[static_cast<std::size_t>(frame)].tilesRendered = static_cast<std::uint64_t>(tiles_);
             frames_[static_cast<std::size_t>(frame)].work = static_cast<std::uint64_t>(workDone_);
         }
-        while (fb_->openCount() > 0)
+        while (run_->openCount() > 0)
             endFirst();
     }
 
@@ -163,17 +165,17 @@ private:
     std::int64_t tilesAhead(int frame) const
     {
         if (isSingle(compositing_))
-            return static_cast<std::int64_t>(fb_->layout().tileCount()) * o_.passes / fb_->size();
+            return static_cast<std::int64_t>(fb().layout().tileCount()) * o_.passes / fb().size();
         const FrameCamera camera = frameCamera(work_.scene->info, work_.settings, frame);
-        const std::size_t visible = dfb::visibleTiles(work_.world, camera, fb_->layout()).size();
-        const int copies = o_.mode == Mode::Mixed ? std::min(o_.replicate, fb_->size()) : 1;
+        const std::size_t visible = dfb::visibleTiles(work_.world, camera, fb().layout()).size();
+        const int copies = o_.mode == Mode::Mixed ? std::min(o_.replicate, fb().size()) : 1;
         return static_cast<std::int64_t>(visible) * o_.passes / copies;
     }
 
     void start(int frame, const dfb::FrameConfig& params)
     {
         clock_.enter(Phase::Render);
-        fb_->start(frame, work_, params);
+        run_->start(frame, work_, params);
         frames_[static_cast<std::size_t>(frame)].times.renderMs += clock_.enter(Phase::Compositing);
     }
 
@@ -181,9 +183,9 @@ private:
     dfb::FrameReport end(int frame)
     {
         if (!writeError_.empty())
-            fb_->addFigure(cannotWriteKey, 1);
+            run_->oldest().addFigure(cannotWriteKey, 1);
         clock_.enter(Phase::Compositing);
-        dfb::FrameReport report = fb_->end();
+        dfb::FrameReport report = run_->end();
         frames_[static_cast<std::size_t>(frame)].times.compositingMs += clock_.enter(Phase::Compositing);
         if (std::any_of(report.figures.begin(), report.figures.end(),
                         [](const dfb::Figure& figure) { return figure.key == cannotWriteKey; }))
@@ -201,7 +203,7 @@ private:
     dfb::FrameReport renderAdaptively(int frame)
     {
         if (!sampler_)
-            sampler_.emplace(fb_->layout(), dfb::SamplingConfig{o_.adaptive, std::min(8, o_.passes), o_.passes, 64});
+            sampler_.emplace(fb().layout(), dfb::SamplingConfig{o_.adaptive, std::min(8, o_.passes), o_.passes, 64});
         else
             sampler_->reset();
         std::optional<dfb::FrameReport> sum;
@@ -227,7 +229,7 @@ private:
                     throw std::runtime_error(writeError_);
             }))
             return false;
-        if (trace_ && !onAllRanks([&] { trace_->write(*fb_, o_.trace); }))
+        if (trace_ && !onAllRanks([&] { trace_->write(fb(), o_.trace); }))
             return false;
         clock_.enter(Phase::Compositing);
         const RankStats mine{
@@ -235,16 +237,16 @@ private:
             clock_.totalMs(),
             threads_,
             bytesRead_};
-        const Loaders ranks = loadersOf(*fb_);
+        const Loaders ranks = loadersOf(fb());
         const auto ofRanks = ranks.gatherOf<RankStats>([&] { return std::vector<RankStats>{mine}; });
         const auto framesOfRanks = ranks.gatherOf<RankFrameStats>([&] { return frames_; });
         const dfb::testing::ErrorReport checked = verification_.report();
         const auto verified =
-            fb_->allReduce({checked.values + checked.bytes, checked.ulps[0] + checked.bytes - checked.wrongBytes,
+            fb().allReduce({checked.values + checked.bytes, checked.ulps[0] + checked.bytes - checked.wrongBytes,
                             checked.others, checked.wrongOthers},
                            dfb::Reduce::Sum);
         return onAllRanks([&] {
-            if (!fb_->isDisplayRank())
+            if (!fb().isDisplayRank())
                 return;
             const RunStats stats = statsOf(ofRanks, framesOfRanks);
             files_.write(stats);
@@ -282,9 +284,9 @@ private:
         const std::int64_t pixels = static_cast<std::int64_t>(o_.width) * o_.height;
         stats.samplesTaken = static_cast<std::uint64_t>(sampler_ ? sampler_->samplesTaken() : pixels * o_.passes);
         stats.samplesSaved = static_cast<std::uint64_t>(pixels * o_.passes) - stats.samplesTaken;
-        if (fb_->image().format() == dfb::OutputFormat::RGBA32F) {
-            stats.imageHash = hashPixels(fb_->image().rgba32f(), fb_->image().pixelCount());
-            stats.meanAlpha = meanAlpha(fb_->image().rgba32f(), fb_->image().pixelCount());
+        if (fb().image().format() == dfb::OutputFormat::RGBA32F) {
+            stats.imageHash = hashPixels(fb().image().rgba32f(), fb().image().pixelCount());
+            stats.meanAlpha = meanAlpha(fb().image().rgba32f(), fb().image().pixelCount());
         }
         return stats;
     }
@@ -296,7 +298,7 @@ private:
         std::printf("%d %s of %dx%d on %zu %s: %.1f ms a frame, %.1f ms of it after the slowest rank had rendered\n",
                     o_.frames, o_.frames == 1 ? "frame" : "frames", o_.width, o_.height, ranks,
                     ranks == 1 ? "rank" : "ranks",
-                    (stats.runMs - stats.ranks[static_cast<std::size_t>(fb_->rank())].times.writeMs) / o_.frames,
+                    (stats.runMs - stats.ranks[static_cast<std::size_t>(fb().rank())].times.writeMs) / o_.frames,
                     last.ranks[slowestOf(last.ranks)].times.compositingMs);
         if (sampler_)
             std::printf("%.1f %% of the samples of --spp %d were taken\n",
@@ -320,7 +322,7 @@ private:
     int threads_;
     std::shared_ptr<dfb::TraceFile> trace_; // null: none is written
     dfb::testing::Verification verification_;
-    std::unique_ptr<RunFrames> fb_;
+    std::unique_ptr<RunFrames> run_;
     RankWork work_;
     dfb::FrameConfig params_;
     std::optional<dfb::AdaptiveSampler> sampler_;

@@ -11,15 +11,6 @@
 
 namespace example {
 
-// Loaders on the ranks of a framebuffer, which must outlive them. No frame may be open while they load.
-template <class FrameBuffer>
-Loaders loadersOf(FrameBuffer& fb)
-{
-    return Loaders(
-        fb.rank(), fb.size(), [&fb](const Loaders::Bytes& bytes) { return fb.allGather(bytes); },
-        [&fb](const std::vector<std::int64_t>& values) { return fb.allReduce(values, dfb::Reduce::Sum); });
-}
-
 struct RankScene {
     SceneInfo info;
     std::vector<std::uint32_t> brickIds; // of the bricks that this rank holds, ascending

@@ -30,16 +30,7 @@ class RunFrames {
 public:
     virtual ~RunFrames() = default;
 
-    // As in DistributedFrameBuffer.
-    virtual int rank() const = 0;
-    virtual int size() const = 0;
-    virtual const dfb::FrameBufferConfig& config() const = 0;
-    virtual const dfb::TileLayout& layout() const = 0;
-    virtual const dfb::Image& image() const = 0;
-    virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, dfb::Reduce how) = 0;
-    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes,
-                                                          const char* call = "allGather()") = 0;
-    bool isDisplayRank() const { return rank() == config().image.displayRank; }
+    virtual dfb::FrameBufferBase& framebuffer() = 0;
 
     // Null if there is none.
     virtual const dfb::DisplayWall* wall() const = 0;
@@ -48,8 +39,9 @@ public:
     virtual void start(int frame, const RankWork& work, const dfb::FrameConfig& params) = 0;
     // How many frames have begun and not ended.
     virtual int openCount() const = 0;
-    // For the oldest open frame; see Frame. If end() throws, the frame stays for leaveAll().
-    virtual void addFigure(std::uint64_t key, double value) = 0;
+    // The oldest open frame.
+    virtual dfb::FrameBase& oldest() = 0;
+    // Ends it. If Frame::end() throws, the frame stays for leaveAll().
     virtual dfb::FrameReport end() = 0;
     // Destroys all open frames without end().
     virtual void leaveAll() = 0;

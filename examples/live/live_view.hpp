@@ -6,6 +6,7 @@
 #pragma once
 
 #include <dfb/frame.hpp>
+#include <dfb/framebuffer_base.hpp>
 
 #include <array>
 #include <chrono>
@@ -105,8 +106,7 @@ public:
 };
 
 // Stores the size and the owners of a framebuffer's tiles in a picture.
-template <class FrameBuffer>
-void tellTiles(const FrameBuffer& fb, LivePicture& picture)
+inline void tellTiles(const dfb::FrameBufferBase& fb, LivePicture& picture)
 {
     picture.tileSize = fb.layout().tileSize();
     for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
@@ -116,8 +116,7 @@ void tellTiles(const FrameBuffer& fb, LivePicture& picture)
 // Returns the wishes of the display rank's viewers, on all ranks, with `ends` set if it is set on any rank. `mine` is,
 // on the display rank, what LiveView::waitForChange() has returned; on the others only its `ends` counts.
 // Collective, outside frames.
-template <class FrameBuffer>
-LiveWishes shareWishes(FrameBuffer& fb, const LiveWishes& mine)
+inline LiveWishes shareWishes(dfb::FrameBufferBase& fb, const LiveWishes& mine)
 {
     const auto* first = reinterpret_cast<const std::byte*>(&mine);
     const auto ofRanks = fb.allGather({first, first + sizeof mine});

@@ -2,7 +2,10 @@
 // bricks of it. A loop gives each tile to a renderer, on all workers; the renderer may throw.
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
+#include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/framebuffer_base.hpp>
 #include <dfb/render/link_owners.hpp>
 #include <dfb/render/shared_world.hpp>
 #include <dfb/render/visibility.hpp>
@@ -65,26 +68,31 @@ struct Job {
 class PassJobs {
 public:
     // `passesOf(item)`: how many passes an item has.
-    template <class PassesOf>
-    void find(std::size_t itemCount, const PassesOf& passesOf)
-    {
-        firstJob_.assign(1, 0);
-        for (std::size_t i = 0; i < itemCount; ++i)
-            firstJob_.push_back(firstJob_.back() + passesOf(i));
-    }
+    void find(std::size_t itemCount, FunctionRef<int(std::size_t)> passesOf);
 
     std::int64_t count() const noexcept { return firstJob_.back(); }
 
-    Job at(std::int64_t job) const
-    {
-        const auto next = std::upper_bound(firstJob_.begin(), firstJob_.end(), job);
-        const auto item = static_cast<std::size_t>(next - firstJob_.begin()) - 1;
-        return {item, static_cast<int>(job - firstJob_[item])};
-    }
+    Job at(std::int64_t job) const;
 
 private:
     std::vector<std::int64_t> firstJob_{0}; // the first job of each item; at the end, the number of jobs
 };
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE void PassJobs::find(std::size_t itemCount, FunctionRef<int(std::size_t)> passesOf)
+{
+    firstJob_.assign(1, 0);
+    for (std::size_t i = 0; i < itemCount; ++i)
+        firstJob_.push_back(firstJob_.back() + passesOf(i));
+}
+
+DFB_COMPILED_ONCE Job PassJobs::at(std::int64_t job) const
+{
+    const auto next = std::upper_bound(firstJob_.begin(), firstJob_.end(), job);
+    const auto item = static_cast<std::size_t>(next - firstJob_.begin()) - 1;
+    return {item, static_cast<int>(job - firstJob_[item])};
+}
+#endif
 
 } // namespace detail
 
@@ -109,6 +117,57 @@ inline std::int64_t scatteringStride(std::int64_t count)
         --stride;
     return std::max<std::int64_t>(stride, 1);
 }
+
+// The jobs of a rank in an image-parallel frame: pairs of tile and pass.
+class ImageShare {
+public:
+    // Some jobs of this rank: first, first + step and so on, modulo the number of all jobs.
+    struct Part {
+        std::int64_t first = 0, count = 0, step = 1;
+    };
+
+    // Calls render(part) until this rank has nothing more to render in this frame.
+    void forEachPart(FrameBase& frame, const FrameBufferBase& fb, WorkDistribution distribution,
+                     FunctionRef<void(const Part&)> render);
+
+    // The tile of the i-th job of a part, and its pass.
+    std::pair<int, int> at(const Part& part, std::int64_t i) const
+    {
+        const Job job = jobs_.at((part.first + i * part.step) % jobs_.count());
+        return {tileOf(job.item), job.pass};
+    }
+
+private:
+    int tileOf(std::size_t item) const { return tiles_ ? (*tiles_)[item] : static_cast<int>(item); }
+
+    const std::vector<int>* tiles_ = nullptr; // null: all tiles of the image
+    PassJobs jobs_;
+};
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE void ImageShare::forEachPart(FrameBase& frame, const FrameBufferBase& fb,
+                                               WorkDistribution distribution, FunctionRef<void(const Part&)> render)
+{
+    tiles_ = distribution == WorkDistribution::Owned ? &frame.ownedTiles() : nullptr;
+    jobs_.find(tiles_ ? tiles_->size() : static_cast<std::size_t>(fb.layout().tileCount()),
+               [&](std::size_t item) { return frame.samples(tileOf(item)).count; });
+    const std::int64_t count = jobs_.count(), rank = fb.rank(), size = fb.size();
+    switch (distribution) {
+    case WorkDistribution::Owned: render({0, count}); break;
+    case WorkDistribution::Linear:
+        render({count * rank / size, count * (rank + 1) / size - count * rank / size});
+        break;
+    case WorkDistribution::RoundRobin: render({rank, (count - rank + size - 1) / size, size}); break;
+    case WorkDistribution::Dynamic: {
+        const std::int64_t stride = scatteringStride(count);
+        for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
+             range = frame.nextJobs(count))
+            render({range.begin * stride, range.end - range.begin, stride});
+        break;
+    }
+    }
+}
+#endif
 
 } // namespace detail
 
@@ -137,38 +196,16 @@ public:
         params.declared = false;
         params.maxLayers = 1;
         auto frame = fb_.begin(params, tileData, pixelData);
-        frame.guard([&] {
-            const bool hasList = distribution_ == WorkDistribution::Owned;
-            const std::vector<int>& tiles = frame.ownedTiles();
-            const auto tileOf = [&](std::size_t item) { return hasList ? tiles[item] : static_cast<int>(item); };
-            jobs_.find(hasList ? tiles.size() : static_cast<std::size_t>(fb_.layout().tileCount()),
-                       [&](std::size_t item) { return frame.samples(tileOf(item)).count; });
-            const std::int64_t count = jobs_.count(), rank = fb_.rank(), size = fb_.size();
-            // Runs `number` jobs: first, first + step and so on, modulo `count`.
-            const auto run = [&](std::int64_t first, std::int64_t number, std::int64_t step = 1) {
-                frame.template forEachTile<detail::TileFor<FrameBuffer, RenderTile>>(
-                    number, [&](std::int64_t i, auto& tile) {
-                        const auto [item, pass] = jobs_.at((first + i * step) % count);
-                        frame.start(tile, tileOf(item), pass);
-                        renderTile(tile);
-                        frame.setTile(tile);
-                    });
-            };
-            switch (distribution_) {
-            case WorkDistribution::Owned: run(0, count); break;
-            case WorkDistribution::Linear:
-                run(count * rank / size, count * (rank + 1) / size - count * rank / size);
-                break;
-            case WorkDistribution::RoundRobin: run(rank, (count - rank + size - 1) / size, size); break;
-            case WorkDistribution::Dynamic: {
-                const std::int64_t stride = detail::scatteringStride(count);
-                for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
-                     range = frame.nextJobs(count))
-                    run(range.begin * stride, range.end - range.begin, stride);
-                break;
-            }
-            }
-        });
+        const auto render = [&](const detail::ImageShare::Part& part) {
+            frame.template forEachTile<detail::TileFor<FrameBuffer, RenderTile>>(
+                part.count, [&](std::int64_t i, auto& tile) {
+                    const auto [index, pass] = share_.at(part, i);
+                    frame.start(tile, index, pass);
+                    renderTile(tile);
+                    frame.setTile(tile);
+                });
+        };
+        frame.guard([&] { share_.forEachPart(frame, fb_, distribution_, render); });
         return frame;
     }
 
@@ -184,7 +221,7 @@ public:
 private:
     FrameBuffer& fb_;
     WorkDistribution distribution_;
-    detail::PassJobs jobs_;
+    detail::ImageShare share_;
 };
 
 namespace detail {
@@ -204,7 +241,10 @@ public:
             if constexpr (FrameBuffer::takesOrder && has_common_eye_v<Camera>)
                 if (!isOrdered)
                     findOrder(config, world, camera.commonEye());
-            findOwners(config, fb, world, camera, !isOrdered && !config.order);
+            if (!FrameBuffer::keepsState)
+                findOwners(config, fb, world, !isOrdered && !config.order, [&](const Box3& box, FoundTile found) {
+                    forEachTile(camera.project(box, fb.layout().width(), fb.layout().height()), fb.layout(), found);
+                });
             return nullptr;
         } catch (...) {
             return std::current_exception();
@@ -214,47 +254,52 @@ public:
 private:
     // Sets config.order if it is not set, all rays begin at `eye`, and the bricks have an order. The time grows with
     // the square of the number of bricks, so it does nothing for more than 1024.
-    void findOrder(FrameConfig& config, const SharedWorld& world, const std::optional<Vec3>& eye)
-    {
-        const std::vector<SharedBrick>& bricks = world.bricks();
-        if (config.order || !eye || bricks.size() > 1024 || frontToBack_.find(world, *eye))
-            return;
-        sources_.clear();
-        for (const int brick : frontToBack_.order())
-            sources_.push_back(bricks[static_cast<std::size_t>(brick)].id);
-        if (!order_ || sources_ != orderSources_) {
-            order_ = std::make_shared<const SourceOrder>(sources_);
-            orderSources_.swap(sources_);
-        }
-        config.order = order_;
-    }
+    void findOrder(FrameConfig& config, const SharedWorld& world, const std::optional<Vec3>& eye);
 
     // Sets config.owners, where ranks are on several nodes, unless it is set or the framebuffer has an owner map.
-    // `hasDepth`: whether inputs have depth.
-    template <class FrameBuffer, class Camera>
-    void findOwners(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
-                    bool hasDepth)
-    {
-        if (FrameBuffer::keepsState || config.owners || fb.config().image.ownerMap)
-            return;
-        if (!owners_)
-            owners_.emplace(fb.nodeOf());
-        if (owners_->isOneNode())
-            return;
-        const TileLayout& layout = fb.layout();
-        owners_->start(layout);
-        for (const SharedBrick& b : world.bricks())
-            forEachTile(
-                camera.project(b.bounds, layout.width(), layout.height()), layout,
-                [&](int tile, const Region& pixels) { owners_->add(tile, pixels, b.ranks.data(), b.ranks.size()); });
-        config.owners = owners_->find(fb.config(), hasDepth, [&](int tile) { return fb.tileOwner(tile); });
-    }
+    // `hasDepth`: whether inputs have depth. `tilesOf(bounds, found)`: the tiles that a box may project to.
+    void findOwners(FrameConfig& config, const FrameBufferBase& fb, const SharedWorld& world, bool hasDepth,
+                    FunctionRef<void(const Box3&, FoundTile)> tilesOf);
 
     FrontToBack frontToBack_;
     std::vector<std::uint32_t> sources_, orderSources_; // orderSources_: of order_
     std::shared_ptr<const SourceOrder> order_;
     std::optional<LinkOwners> owners_;
 };
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE void FromWorld::findOrder(FrameConfig& config, const SharedWorld& world,
+                                            const std::optional<Vec3>& eye)
+{
+    const std::vector<SharedBrick>& bricks = world.bricks();
+    if (config.order || !eye || bricks.size() > 1024 || frontToBack_.find(world, *eye))
+        return;
+    sources_.clear();
+    for (const int brick : frontToBack_.order())
+        sources_.push_back(bricks[static_cast<std::size_t>(brick)].id);
+    if (!order_ || sources_ != orderSources_) {
+        order_ = std::make_shared<const SourceOrder>(sources_);
+        orderSources_.swap(sources_);
+    }
+    config.order = order_;
+}
+
+DFB_COMPILED_ONCE void FromWorld::findOwners(FrameConfig& config, const FrameBufferBase& fb, const SharedWorld& world,
+                                             bool hasDepth, FunctionRef<void(const Box3&, FoundTile)> tilesOf)
+{
+    if (config.owners || fb.config().image.ownerMap)
+        return;
+    if (!owners_)
+        owners_.emplace(fb.nodeOf());
+    if (owners_->isOneNode())
+        return;
+    owners_->start(fb.layout());
+    for (const SharedBrick& b : world.bricks())
+        tilesOf(b.bounds,
+                [&](int tile, const Region& pixels) { owners_->add(tile, pixels, b.ranks.data(), b.ranks.size()); });
+    config.owners = owners_->find(fb.config(), hasDepth, [&](int tile) { return fb.tileOwner(tile); });
+}
+#endif
 
 // The jobs of a rank that renders its own bricks, and its declaration.
 class OwnBricks {
@@ -266,9 +311,7 @@ public:
     {
         frame.guard([&] {
             pairs_ = visibleTiles(world, camera, fb.layout(), std::move(pairs_));
-            inputs_ = inputsOf(world, pairs_, std::move(inputs_));
-            frame.declare(inputs_);
-            jobs_.find(pairs_.size(), [&](std::size_t i) { return frame.samples(pairs_[i].tile).count; });
+            declare(frame, world);
             frame.template forEachTile<TileFor<FrameBuffer, Render>>(jobs_.count(), [&](std::int64_t i, auto& tile) {
                 const auto [item, pass] = jobs_.at(i);
                 const Brick& brick = brickOf(world, pairs_[item]);
@@ -281,6 +324,13 @@ public:
     }
 
 private:
+    void declare(FrameBase& frame, const World& world)
+    {
+        inputs_ = inputsOf(world, pairs_, std::move(inputs_));
+        frame.declare(inputs_);
+        jobs_.find(pairs_.size(), [&](std::size_t i) { return frame.samples(pairs_[i].tile).count; });
+    }
+
     std::vector<BrickInTile> pairs_;
     std::vector<TileInput> inputs_;
     PassJobs jobs_;

@@ -13,7 +13,10 @@
 #pragma once
 
 #include <dfb/base/detect.hpp>
+#include <dfb/base/function_ref.hpp>
+#include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/framebuffer_base.hpp>
 #include <dfb/render/loops.hpp>
 #include <dfb/render/shared_world.hpp>
 
@@ -163,6 +166,9 @@ DFB_DETECTS(has_plan_v,
             std::declval<T&>().plan(std::declval<const SharedWorld&>(), std::declval<const std::vector<BrickInTile>&>(),
                                     std::declval<const std::vector<int>&>()));
 
+// A tile-brick owner of any type.
+using OwnerRef = FunctionRef<int(const SharedBrick& brick, int tile, int pass)>;
+
 // The jobs of a mixed-parallel frame.
 struct MixedWork {
     std::vector<BrickInTile> pairs; // tile by tile
@@ -170,34 +176,50 @@ struct MixedWork {
     std::vector<Job> jobs;          // of this rank; `item` is an index into `pairs`
 
     // Finds the jobs that `owner` gives to the rank `own`. Tells the frame how many bricks meet in a tile.
-    template <class Frame, class Owner>
-    void findJobs(Frame& frame, const SharedWorld& world, Owner& owner, int own)
+    template <class Owner>
+    void findJobs(FrameBase& frame, const SharedWorld& world, Owner& owner, int own)
     {
-        passes.clear();
-        int inTile = 0, most = 1;
-        for (std::size_t p = 0; p < pairs.size(); ++p) {
-            passes.push_back(frame.samples(pairs[p].tile).count);
-            inTile = p > 0 && pairs[p].tile == pairs[p - 1].tile ? inTile + 1 : 1;
-            most = std::max(most, inTile);
-        }
-        frame.expectLayers(most);
+        countPasses(frame);
         if constexpr (has_plan_v<Owner>)
             owner.plan(world, pairs, passes);
-        jobs.clear();
-        for (std::size_t p = 0; p < pairs.size(); ++p) {
-            const SharedBrick& brick = brickOf(world, pairs[p]);
-            for (int pass = 0; pass < passes[p]; ++pass) {
-                const int rank = owner(brick, pairs[p].tile, pass);
-                if (!std::binary_search(brick.ranks.begin(), brick.ranks.end(), rank))
-                    detail::failArgument(
-                        "the tile-brick owner gives tile %d of brick %u to rank %d, which does not hold it",
-                        pairs[p].tile, brick.id, rank);
-                if (rank == own)
-                    jobs.push_back({p, pass});
-            }
+        pickJobs(
+            world, [&](const SharedBrick& brick, int tile, int pass) { return owner(brick, tile, pass); }, own);
+    }
+
+private:
+    void countPasses(FrameBase& frame);
+    void pickJobs(const SharedWorld& world, OwnerRef owner, int own);
+};
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE void MixedWork::countPasses(FrameBase& frame)
+{
+    passes.clear();
+    int inTile = 0, most = 1;
+    for (std::size_t p = 0; p < pairs.size(); ++p) {
+        passes.push_back(frame.samples(pairs[p].tile).count);
+        inTile = p > 0 && pairs[p].tile == pairs[p - 1].tile ? inTile + 1 : 1;
+        most = std::max(most, inTile);
+    }
+    frame.expectLayers(most);
+}
+
+DFB_COMPILED_ONCE void MixedWork::pickJobs(const SharedWorld& world, OwnerRef owner, int own)
+{
+    jobs.clear();
+    for (std::size_t p = 0; p < pairs.size(); ++p) {
+        const SharedBrick& brick = brickOf(world, pairs[p]);
+        for (int pass = 0; pass < passes[p]; ++pass) {
+            const int rank = owner(brick, pairs[p].tile, pass);
+            if (!std::binary_search(brick.ranks.begin(), brick.ranks.end(), rank))
+                failArgument("the tile-brick owner gives tile %d of brick %u to rank %d, which does not hold it",
+                             pairs[p].tile, brick.id, rank);
+            if (rank == own)
+                jobs.push_back({p, pass});
         }
     }
-};
+}
+#endif
 
 // The work of an OrderedLoop: that of a MixedParallelLoop in a known order.
 struct OrderedWork : MixedWork {
@@ -212,32 +234,10 @@ struct OrderedWork : MixedWork {
     std::vector<Job> undecided; // jobs that another rank may hide
 
     // Sorts `pairs` by tile, then front to back. Throws InvalidArgument if `order` does not have each brick once.
-    void sortFrontToBack(const SharedWorld& world, const std::vector<int>& order)
-    {
-        place.assign(world.bricks().size(), -1);
-        for (std::size_t i = 0; i < order.size(); ++i)
-            if (const auto brick = static_cast<std::size_t>(order[i]); brick < place.size())
-                place[brick] = static_cast<int>(i);
-        if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
-            detail::failArgument("the order does not have each brick once");
-        std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
-            return a.tile != b.tile
-                       ? a.tile < b.tile
-                       : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
-        });
-    }
+    void sortFrontToBack(const SharedWorld& world, const std::vector<int>& order);
 
     // Finds which of this rank's tiles no brick projects to, and where the pairs of the other tiles begin.
-    void findEmpty(int tileCount, const std::vector<int>& ownedTiles)
-    {
-        firstPair.assign(static_cast<std::size_t>(tileCount), -1);
-        for (std::size_t p = pairs.size(); p-- > 0;)
-            firstPair[static_cast<std::size_t>(pairs[p].tile)] = static_cast<int>(p);
-        empty.clear();
-        for (const int tile : ownedTiles)
-            if (firstPair[static_cast<std::size_t>(tile)] < 0)
-                empty.push_back(tile);
-    }
+    void findEmpty(int tileCount, const std::vector<int>& ownedTiles);
 
     int generationOf(const Job& job) const
     {
@@ -246,55 +246,133 @@ struct OrderedWork : MixedWork {
 
     // Puts the jobs first that are in front in their tile, so that other ranks hear soon which inputs are hidden. Not
     // for images in which nothing is hidden: their tiles would be complete later.
-    void renderFrontsFirst()
-    {
-        std::stable_partition(jobs.begin(), jobs.end(), [this](const Job& job) { return generationOf(job) == 0; });
-    }
+    void renderFrontsFirst();
 
     // Announces this rank's inputs that hid others in the last frame, which are likely to do so again, to the ranks
     // behind them.
-    template <class Frame, class Owner>
-    void announceHiders(const Frame& frame, const SharedWorld& world, int tileCount, Owner& owner)
-    {
-        if (hider.size() != static_cast<std::size_t>(tileCount)) {
-            hider = std::vector<std::atomic<int>>(static_cast<std::size_t>(tileCount));
-            std::fill(hider.begin(), hider.end(), -1);
-        }
-        announced.assign(hider.size(), -1);
-        for (const Job& job : jobs) {
-            const BrickInTile& pair = pairs[job.item];
-            const auto tile = static_cast<std::size_t>(pair.tile);
-            if (hider[tile] != pair.brick || !frame.opaqueHides(pair.tile))
-                continue;
-            announced[tile] = pair.brick;
-            forEachRankBehind(world, job, owner,
-                              [&](int generation, int rank) { frame.mayHide(pair.tile, generation, rank); });
-        }
-    }
+    void announceHiders(const FrameBase& frame, const SharedWorld& world, int tileCount, OwnerRef owner);
 
+    // Tells the ranks behind an input that it hides theirs; or, if they wait to be told, that it does not.
+    void tellBehind(const FrameBase& frame, const SharedWorld& world, const Job& job, OwnerRef owner, bool hides);
+
+    // Waits until other ranks have said of some undecided jobs whether they hide them, and moves these to `jobs`.
+    // Returns false if there are no more, or the frame has failed.
+    bool takeDecided(const FrameBase& frame);
+
+private:
     // Calls f(generation, rank) for each rank that renders something behind a job. `generation` is the first one behind
     // it.
-    template <class Owner, class F>
-    void forEachRankBehind(const SharedWorld& world, const Job& job, Owner& owner, const F& f) const
-    {
-        const int tile = pairs[job.item].tile;
-        static thread_local std::vector<int> spare; // not used itself, as owner() may do other work meanwhile
-        std::vector<int> told = std::move(spare);
-        told.clear();
-        for (std::size_t p = job.item + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
-            const int rank = owner(brickOf(world, pairs[p]), tile, 0);
-            if (std::find(told.begin(), told.end(), rank) != told.end())
-                continue;
-            f(generationOf(job) + 1, rank);
-            told.push_back(rank);
-        }
-        spare = std::move(told);
-    }
+    void forEachRankBehind(const SharedWorld& world, const Job& job, OwnerRef owner,
+                           FunctionRef<void(int, int)> f) const;
 };
 
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE void OrderedWork::sortFrontToBack(const SharedWorld& world, const std::vector<int>& order)
+{
+    place.assign(world.bricks().size(), -1);
+    for (std::size_t i = 0; i < order.size(); ++i)
+        if (const auto brick = static_cast<std::size_t>(order[i]); brick < place.size())
+            place[brick] = static_cast<int>(i);
+    if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
+        failArgument("the order does not have each brick once");
+    std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
+        return a.tile != b.tile ? a.tile < b.tile
+                                : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
+    });
+}
+
+DFB_COMPILED_ONCE void OrderedWork::findEmpty(int tileCount, const std::vector<int>& ownedTiles)
+{
+    firstPair.assign(static_cast<std::size_t>(tileCount), -1);
+    for (std::size_t p = pairs.size(); p-- > 0;)
+        firstPair[static_cast<std::size_t>(pairs[p].tile)] = static_cast<int>(p);
+    empty.clear();
+    for (const int tile : ownedTiles)
+        if (firstPair[static_cast<std::size_t>(tile)] < 0)
+            empty.push_back(tile);
+}
+
+DFB_COMPILED_ONCE void OrderedWork::renderFrontsFirst()
+{
+    std::stable_partition(jobs.begin(), jobs.end(), [this](const Job& job) { return generationOf(job) == 0; });
+}
+
+DFB_COMPILED_ONCE void OrderedWork::announceHiders(const FrameBase& frame, const SharedWorld& world, int tileCount,
+                                                   OwnerRef owner)
+{
+    if (hider.size() != static_cast<std::size_t>(tileCount)) {
+        hider = std::vector<std::atomic<int>>(static_cast<std::size_t>(tileCount));
+        std::fill(hider.begin(), hider.end(), -1);
+    }
+    announced.assign(hider.size(), -1);
+    for (const Job& job : jobs) {
+        const BrickInTile& pair = pairs[job.item];
+        const auto tile = static_cast<std::size_t>(pair.tile);
+        if (hider[tile] != pair.brick || !frame.opaqueHides(pair.tile))
+            continue;
+        announced[tile] = pair.brick;
+        forEachRankBehind(world, job, owner,
+                          [&](int generation, int rank) { frame.mayHide(pair.tile, generation, rank); });
+    }
+}
+
+DFB_COMPILED_ONCE void OrderedWork::tellBehind(const FrameBase& frame, const SharedWorld& world, const Job& job,
+                                               OwnerRef owner, bool hides)
+{
+    const BrickInTile& pair = pairs[job.item];
+    const auto tile = static_cast<std::size_t>(pair.tile);
+    if (!hides && announced[tile] != pair.brick)
+        return; // nobody waits
+    if (hides)
+        anyHidden = true;
+    hider[tile] = hides ? pair.brick : -1;
+    forEachRankBehind(world, job, owner, [&](int generation, int rank) {
+        if (hides)
+            frame.hide(pair.tile, generation, rank);
+        else
+            frame.show(pair.tile, generation, rank);
+    });
+}
+
+DFB_COMPILED_ONCE bool OrderedWork::takeDecided(const FrameBase& frame)
+{
+    const auto isUndecided = [&](const Job& job) { return frame.isUndecided(pairs[job.item].tile, generationOf(job)); };
+    while (!undecided.empty() && !frame.failed()) {
+        auto decided = std::stable_partition(undecided.begin(), undecided.end(), isUndecided);
+        const auto heard = [&] { return !std::all_of(undecided.begin(), undecided.end(), isUndecided); };
+        if (decided == undecided.end()) {
+            if (frame.waitForWord(heard))
+                continue;
+            decided = undecided.begin(); // there was no word in time
+        }
+        jobs.assign(decided, undecided.end());
+        undecided.erase(decided, undecided.end());
+        return true;
+    }
+    return false;
+}
+
+DFB_COMPILED_ONCE void OrderedWork::forEachRankBehind(const SharedWorld& world, const Job& job, OwnerRef owner,
+                                                      FunctionRef<void(int, int)> f) const
+{
+    const int tile = pairs[job.item].tile;
+    static thread_local std::vector<int> spare; // not used itself, as owner() may do other work meanwhile
+    std::vector<int> told = std::move(spare);
+    told.clear();
+    for (std::size_t p = job.item + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
+        const int rank = owner(brickOf(world, pairs[p]), tile, 0);
+        if (std::find(told.begin(), told.end(), rank) != told.end())
+            continue;
+        f(generationOf(job) + 1, rank);
+        told.push_back(rank);
+    }
+    spare = std::move(told);
+}
+#endif
+
 // Calls renderBrick, and takes note of the cost for an owner that plans.
-template <class Owner, class Frame, class RenderBrick, class Tile>
-void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& renderBrick, Tile& tile)
+template <class Owner, class RenderBrick, class Tile>
+void renderMeasured(const FrameBase& frame, const Brick& brick, const RenderBrick& renderBrick, Tile& tile)
 {
     if constexpr (!has_plan_v<Owner>) {
         renderBrick(brick, tile);
@@ -412,10 +490,11 @@ public:
                                                                        [&](const auto& tile) { frame.setTile(tile); });
             if (work_.anyHidden.exchange(false))
                 work_.renderFrontsFirst();
-            work_.announceHiders(frame, world_, fb_.layout().tileCount(), owner_);
+            work_.announceHiders(frame, world_, fb_.layout().tileCount(), owner());
             work_.undecided.clear();
             renderJobs(frame, renderBrick, true);
-            renderUndecided(frame, renderBrick);
+            while (work_.takeDecided(frame))
+                renderJobs(frame, renderBrick, false);
         });
         return frame;
     }
@@ -457,53 +536,19 @@ private:
             try {
                 detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
                 frame.setTile(tile);
-            } catch (...) {
-                tellBehind(frame, job, false); // in a partial frame, others would wait to be told
+            } catch (...) { // in a partial frame, others would wait to be told
+                work_.tellBehind(frame, world_, job, owner(), false);
                 throw;
             }
             if (tile.children > 0 && frame.opaqueHides(pair.tile))
-                tellBehind(frame, job, frame.hidesRest(tile));
+                work_.tellBehind(frame, world_, job, owner(), frame.hidesRest(tile));
         });
     }
 
-    // Renders the inputs that other ranks may hide, each as soon as those ranks have said that they do not.
-    template <class RenderBrick>
-    void renderUndecided(typename FrameBuffer::Frame& frame, const RenderBrick& renderBrick)
+    // The owner, in the form that OrderedWork takes.
+    auto owner() const
     {
-        auto& undecided = work_.undecided;
-        const auto isUndecided = [&](const detail::Job& job) {
-            return frame.isUndecided(work_.pairs[job.item].tile, work_.generationOf(job));
-        };
-        for (bool mayWait = true; !undecided.empty() && !frame.failed();) {
-            const auto decided =
-                mayWait ? std::stable_partition(undecided.begin(), undecided.end(), isUndecided) : undecided.begin();
-            if (decided == undecided.end()) {
-                mayWait =
-                    frame.waitForWord([&] { return !std::all_of(undecided.begin(), undecided.end(), isUndecided); });
-                continue;
-            }
-            work_.jobs.assign(decided, undecided.end());
-            undecided.erase(decided, undecided.end());
-            renderJobs(frame, renderBrick, false);
-        }
-    }
-
-    // Tells the ranks behind an input that it hides theirs; or, if they wait to be told, that it does not.
-    void tellBehind(typename FrameBuffer::Frame& frame, const detail::Job& job, bool hides)
-    {
-        const BrickInTile& pair = work_.pairs[job.item];
-        const auto tile = static_cast<std::size_t>(pair.tile);
-        if (!hides && work_.announced[tile] != pair.brick)
-            return; // nobody waits
-        if (hides)
-            work_.anyHidden = true;
-        work_.hider[tile] = hides ? pair.brick : -1;
-        work_.forEachRankBehind(world_, job, owner_, [&](int generation, int rank) {
-            if (hides)
-                frame.hide(pair.tile, generation, rank);
-            else
-                frame.show(pair.tile, generation, rank);
-        });
+        return [this](const SharedBrick& brick, int tile, int pass) { return owner_(brick, tile, pass); };
     }
 
     FrameBuffer& fb_;

@@ -4,6 +4,7 @@
 
 #include <dfb/base/detect.hpp>
 #include <dfb/compiled.hpp>
+#include <dfb/framebuffer_base.hpp>
 #include <dfb/render/visibility.hpp>
 
 #include <algorithm>
@@ -28,40 +29,7 @@ public:
     // Gathers the bricks of all ranks. Bricks with the same id are the same brick. Collective, outside frames. Waits
     // and throws as DistributedFrameBuffer::allGather(). Also throws InvalidArgument on all ranks if the bounds of one
     // brick differ between ranks, or if the bricks of a rank cannot be read.
-    template <class FrameBuffer>
-    SharedWorld(FrameBuffer& fb, const World& world)
-    {
-        static_assert(std::is_trivially_copyable_v<Brick>);
-        const auto* first = reinterpret_cast<const std::byte*>(world.bricks().data());
-        const std::vector<std::vector<std::byte>> all =
-            fb.allGather({first, first + world.bricks().size() * sizeof(Brick)}, "SharedWorld()");
-        std::vector<std::pair<Brick, int>> held;
-        for (std::size_t rank = 0; rank < all.size(); ++rank) {
-            if (all[rank].size() % sizeof(Brick) != 0)
-                detail::failArgument("the bricks of rank %zu have %zu bytes", rank, all[rank].size());
-            for (std::size_t at = 0; at < all[rank].size(); at += sizeof(Brick)) {
-                Brick brick;
-                std::memcpy(&brick, all[rank].data() + at, sizeof brick);
-                if (!detail::isBox(brick.bounds))
-                    detail::failArgument("the bounds of brick %u of rank %zu are not a box", brick.id, rank);
-                held.emplace_back(brick, static_cast<int>(rank));
-            }
-        }
-        std::sort(held.begin(), held.end(), [](const auto& a, const auto& b) {
-            return a.first.id != b.first.id ? a.first.id < b.first.id : a.second < b.second;
-        });
-        for (const auto& [brick, rank] : held) {
-            if (bricks_.empty() || bricks_.back().id != brick.id)
-                bricks_.push_back({brick, {}});
-            SharedBrick& shared = bricks_.back();
-            if (!(shared.bounds == brick.bounds))
-                detail::failArgument("brick %u has other bounds on rank %d than on rank %d", brick.id, rank,
-                                     shared.ranks.front());
-            if (!shared.ranks.empty() && shared.ranks.back() == rank)
-                detail::failArgument("brick %u comes twice from rank %d", brick.id, rank);
-            shared.ranks.push_back(rank);
-        }
-    }
+    SharedWorld(FrameBufferBase& fb, const World& world);
 
     // Sorted by ascending id.
     const std::vector<SharedBrick>& bricks() const noexcept { return bricks_; }
@@ -69,6 +37,42 @@ public:
 private:
     std::vector<SharedBrick> bricks_;
 };
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE SharedWorld::SharedWorld(FrameBufferBase& fb, const World& world)
+{
+    static_assert(std::is_trivially_copyable_v<Brick>);
+    const auto* first = reinterpret_cast<const std::byte*>(world.bricks().data());
+    const std::vector<std::vector<std::byte>> all =
+        fb.allGather({first, first + world.bricks().size() * sizeof(Brick)}, "SharedWorld()");
+    std::vector<std::pair<Brick, int>> held;
+    for (std::size_t rank = 0; rank < all.size(); ++rank) {
+        if (all[rank].size() % sizeof(Brick) != 0)
+            detail::failArgument("the bricks of rank %zu have %zu bytes", rank, all[rank].size());
+        for (std::size_t at = 0; at < all[rank].size(); at += sizeof(Brick)) {
+            Brick brick;
+            std::memcpy(&brick, all[rank].data() + at, sizeof brick);
+            if (!detail::isBox(brick.bounds))
+                detail::failArgument("the bounds of brick %u of rank %zu are not a box", brick.id, rank);
+            held.emplace_back(brick, static_cast<int>(rank));
+        }
+    }
+    std::sort(held.begin(), held.end(), [](const auto& a, const auto& b) {
+        return a.first.id != b.first.id ? a.first.id < b.first.id : a.second < b.second;
+    });
+    for (const auto& [brick, rank] : held) {
+        if (bricks_.empty() || bricks_.back().id != brick.id)
+            bricks_.push_back({brick, {}});
+        SharedBrick& shared = bricks_.back();
+        if (!(shared.bounds == brick.bounds))
+            detail::failArgument("brick %u has other bounds on rank %d than on rank %d", brick.id, rank,
+                                 shared.ranks.front());
+        if (!shared.ranks.empty() && shared.ranks.back() == rank)
+            detail::failArgument("brick %u comes twice from rank %d", brick.id, rank);
+        shared.ranks.push_back(rank);
+    }
+}
+#endif
 
 namespace detail {
 

@@ -12,6 +12,7 @@
 // Loops call both on the thread that is in start(); if they throw, the frame fails on all ranks.
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
 #include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/image.hpp>
@@ -319,10 +320,24 @@ struct BrickInTile {
 
 namespace detail {
 
+using FoundTile = FunctionRef<void(int tile, const Region& pixels)>;
+
 // Calls found(tile, pixels) for each tile that the projection may cover, with a rectangle around its pixels there. A
 // tile may come up twice.
-template <class Found>
-void forEachTile(const Region& projection, const TileLayout& layout, const Found& found)
+DFB_COMPILED_ONCE void forEachTile(const Region& projection, const TileLayout& layout, FoundTile found);
+DFB_COMPILED_ONCE void forEachTile(const Footprint& projection, const TileLayout& layout, FoundTile found);
+template <class Projection>
+void forEachTile(const std::vector<Projection>& projections, const TileLayout& layout, FoundTile found)
+{
+    for (const Projection& projection : projections)
+        forEachTile(projection, layout, found);
+}
+
+// Sorts the pairs by tile, then by brick, and leaves each once.
+DFB_COMPILED_ONCE void sortPairs(std::vector<BrickInTile>& pairs);
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE void forEachTile(const Region& projection, const TileLayout& layout, FoundTile found)
 {
     const Region tiles = layout.tilesIn(projection);
     for (int row = tiles.y0; row < tiles.y1; ++row)
@@ -331,20 +346,23 @@ void forEachTile(const Region& projection, const TileLayout& layout, const Found
             found(tile, intersection(projection, layout.region(tile)));
         }
 }
-template <class Found>
-void forEachTile(const Footprint& projection, const TileLayout& layout, const Found& found)
+
+DFB_COMPILED_ONCE void forEachTile(const Footprint& projection, const TileLayout& layout, FoundTile found)
 {
     forEachTile(projection.region(), layout, [&](int tile, const Region& pixels) {
         if (projection.meets(layout.region(tile)))
             found(tile, pixels);
     });
 }
-template <class Projection, class Found>
-void forEachTile(const std::vector<Projection>& projections, const TileLayout& layout, const Found& found)
+
+DFB_COMPILED_ONCE void sortPairs(std::vector<BrickInTile>& pairs)
 {
-    for (const Projection& projection : projections)
-        forEachTile(projection, layout, found);
+    const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };
+    std::sort(pairs.begin(), pairs.end(), [&](const auto& a, const auto& b) { return key(a) < key(b); });
+    const auto isSame = [&](const auto& a, const auto& b) { return key(a) == key(b); };
+    pairs.erase(std::unique(pairs.begin(), pairs.end(), isSame), pairs.end());
 }
+#endif
 
 // The brick of a pair, of a World or a SharedWorld.
 template <class AnyWorld>
@@ -368,11 +386,7 @@ std::vector<BrickInTile> visibleTiles(const AnyWorld& world, const Camera& camer
                             [&](int tile, const Region&) {
                                 memory.push_back({static_cast<int>(b), tile});
                             });
-    const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };
-    std::sort(memory.begin(), memory.end(), [&](const auto& a, const auto& b) { return key(a) < key(b); });
-    memory.erase(
-        std::unique(memory.begin(), memory.end(), [&](const auto& a, const auto& b) { return key(a) == key(b); }),
-        memory.end());
+    detail::sortPairs(memory);
     return memory;
 }
 
