@@ -117,7 +117,12 @@ DFB_COMPILED_ONCE void DisplayWall::finish(std::int64_t frame, std::chrono::mill
 DFB_COMPILED_ONCE const Image& DisplayWall::image(int display) const { return wall_->image(display); }
 DFB_COMPILED_ONCE std::int64_t DisplayWall::imageFrame() const noexcept { return wall_->imageFrame(); }
 
-DFB_COMPILED_ONCE void ToWall::newFrame(const NoFrameData&) { wall->wall_->begin(); }
+DFB_COMPILED_ONCE void ToWall::newFrame(const NoFrameData&)
+{
+    if (!wall)
+        detail::failArgument("ToWall without a DisplayWall");
+    wall->wall_->begin();
+}
 DFB_COMPILED_ONCE void ToWall::process(PixelTile& tile) const { wall->wall_->put(tile); }
 
 DFB_NAMESPACE_END

@@ -356,8 +356,10 @@ FrameBufferBase::FrameBufferBase(std::shared_ptr<Connection> connection, Config&
 {
     if (!config.executor)
         config.executor = detail::makeThreads(*connection_);
-    for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
-        operations_.push_back(makeOperations());
+    connection_->giveUpIfThrows([&] {
+        for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
+            operations_.push_back(makeOperations());
+    });
     makeEngines(config);
 }
 

@@ -77,6 +77,7 @@ struct OwnLoop {
         const auto report = render(partial, throws);
         result.expect(report.failure.has_value() && report.failure->tile == bad, "partial: no failure");
         result.expect(report.tilesIncomplete == 1, std::to_string(report.tilesIncomplete) + " tiles are missing");
+        result.expect(report.tilesTouched > 0, "partial: no tile counts as touched");
         if (fb.isDisplayRank())
             for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
                 result.expect(fb.isComplete(tile) == (tile != bad), "tile " + std::to_string(tile));

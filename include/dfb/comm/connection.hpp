@@ -2,12 +2,15 @@
 // message is for, checks that each message comes once and whole, and moves messages (section 3.2 of the paper).
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
 #include <dfb/base/processors.hpp>
 #include <dfb/comm/heartbeat.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
 #include <dfb/comm/reduction.hpp>
 #include <dfb/comm/transport.hpp>
+#include <dfb/compiled.hpp>
+#include <dfb/exec.hpp>
 #include <dfb/fwd.hpp>
 
 #include <algorithm>
@@ -332,6 +335,21 @@ public:
         return true;
     }
 
+    // Runs a step in which an object is made that exists on all ranks. If the step throws, the connection fails, as the
+    // other ranks would wait for this one. Throws what the step throws.
+    void giveUpIfThrows(detail::FunctionRef<void()> step)
+    {
+        try {
+            step();
+        } catch (const std::exception& e) {
+            leave(e.what());
+            throw;
+        } catch (...) {
+            leave("an exception that is not a std::exception");
+            throw;
+        }
+    }
+
 private:
     using Clock = std::chrono::steady_clock;
 
@@ -583,5 +601,21 @@ std::shared_ptr<Connection> connect(const typename Transport::Communicator& comm
     auto link = std::make_unique<detail::LinkOver<Transport>>(communicator, pool, config.progress);
     return std::make_shared<Connection>(std::move(config), std::move(pool), std::move(link));
 }
+
+namespace detail {
+
+// Makes an executor with Connection::threadShare() threads. If the system gives no threads, the connection fails.
+DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(Connection& connection);
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(Connection& connection)
+{
+    std::shared_ptr<ThreadExecutor> threads;
+    connection.giveUpIfThrows([&] { threads = std::make_shared<ThreadExecutor>(connection.threadShare()); });
+    return threads;
+}
+#endif
+
+} // namespace detail
 
 DFB_NAMESPACE_END

@@ -83,8 +83,5 @@ struct LeaveFrame {
 DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,
                                                      Operations& operations, int slot);
 
-// Makes an executor with Connection::threadShare() threads. If the system gives no threads, the connection fails.
-DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(Connection& connection);
-
 } // namespace detail
 DFB_NAMESPACE_END

@@ -709,7 +709,7 @@ private:
         pipeline_->addTo(v);
         v.sums.bytesSent = mailbox_->bytesSent() + pipeline_->gather().placedBytes();
         v.sums.messagesSent = mailbox_->messagesSent();
-        v.sums.tilesTouched = open_.areTilesFinished() ? pipeline_->table().touchedCount() : 0;
+        v.sums.tilesTouched = pipeline_->table().touchedCount();
         v.sums.lateMessages = open_.takeLateCount();
         v.sums.repeatedMessages = mailbox_->connection().takeDuplicates();
         v.sums.compressedLinks = compression_.links();
@@ -774,16 +774,6 @@ private:
 };
 
 #if DFB_HAS_BODIES
-DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(Connection& connection)
-{
-    try {
-        return std::make_shared<ThreadExecutor>(connection.threadShare());
-    } catch (const std::exception& e) { // the other ranks would wait for this one
-        connection.giveUp(errorInfo(ErrorKind::Transport, e.what(), connection.rank()));
-        throw;
-    }
-}
-
 DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,
                                                      Operations& operations, int slot)
 {

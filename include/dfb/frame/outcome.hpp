@@ -291,7 +291,8 @@ public:
     // Whether the frame has an image although something is missing.
     bool isPartial(const Verdict& verdict) const
     {
-        return terms_.allowPartial && verdict.error && verdict.error->kind != ErrorKind::Disagreement;
+        return terms_.allowPartial && verdict.error && verdict.error->kind != ErrorKind::Disagreement
+               && verdict.differing.empty();
     }
 
 private:

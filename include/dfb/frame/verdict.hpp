@@ -351,6 +351,8 @@ struct Verdict {
         a.figures = merged(a.figures, b.figures);
         a.mergeErrors = merged(a.mergeErrors, b.mergeErrors);
         a.incomplete.insert(a.incomplete.end(), b.incomplete.begin(), b.incomplete.end()); // each tile has one owner
+        if (!a.differing.empty()) // or several, if ranks disagree about owners; then there is no partial image
+            a.incomplete.clear();
         return a.bytes();
     }
 };

@@ -408,9 +408,11 @@ public:
         return imageFrame_ >= 0 && !std::binary_search(incomplete_.begin(), incomplete_.end(), tile);
     }
 
-    // The frame has failed: nothing in the image can be relied on.
+    // The frame has failed: nothing in the image can be relied on. A rank that took itself for the owner of a tile may
+    // have written to the image of all.
     void invalidate()
     {
+        ++imageEpoch_;
         for (auto& s : state_)
             s = TileState::Undefined;
     }

@@ -34,7 +34,7 @@ public:
         : layout_(layout), format_(format), pool_(connection->pool())
     {
         if (!executor)
-            executor = std::make_shared<ThreadExecutor>(connection->threadShare());
+            executor = makeThreads(*connection);
         const std::size_t largest = prefix + std::size_t{256} * 256 * bytesPerPixel(OutputFormat::RGBA32F);
         MailboxOwner& self = *this;
         mailbox_ = std::make_unique<Mailbox>(std::move(connection), std::move(executor),

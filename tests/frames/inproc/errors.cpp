@@ -1576,6 +1576,85 @@ TEST_CASE("Ranks that began a partial frame differently disagree, whatever else 
     CHECK(has(texts[0], "then fine"));
 }
 
+TEST_CASE("Ranks of which only some begin a partial frame get the same error, and the next is fine", "[errors]")
+{
+    for (const int partialOn : {0, 1}) { // rank 0 has the image
+        const auto params = [=](int rank) {
+            dfb::FrameConfig p;
+            p.allowPartial = rank == partialOn;
+            p.timeout = std::chrono::milliseconds(20000);
+            return p;
+        };
+        const auto texts = partialFrame(params, [](auto&, int) {});
+        INFO(joined(texts));
+        CHECK(allSame(texts));
+        CHECK(has(texts[0], "FrameError: "));
+        CHECK(has(texts[0], "then fine"));
+    }
+}
+
+TEST_CASE("Ranks that disagree about who owns the tiles of a partial frame go on after it", "[errors]")
+{
+    std::vector<std::string> texts(2), after(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<Blend> fb(communicator, configOf(scene::makeScene(0)));
+        const auto rank = static_cast<std::size_t>(fb.rank());
+        texts[rank] = outcomeOf([&] {
+            dfb::FrameConfig params;
+            params.allowPartial = true;
+            params.owners =
+                std::make_shared<const std::vector<int>>(static_cast<std::size_t>(fb.layout().tileCount()), fb.rank());
+            auto frame = fb.begin(params);
+            // All tiles are missing on both ranks: twice as many as the image has.
+            for (const int tile : frame.ownedTiles())
+                frame.abort(std::make_exception_ptr(std::runtime_error("no such tile")), tile);
+            frame.end();
+        });
+        after[rank] = outcomeOf([&] {
+            auto frame = fb.begin();
+            sendOwned(fb, frame);
+            frame.end();
+        });
+    });
+    INFO(joined(texts));
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "FrameError: dfb: ranks disagree"));
+    CHECK(after == std::vector<std::string>(2, "fine"));
+}
+
+namespace {
+
+// Cannot be copied on one rank.
+struct CopiesOn0 {
+    int rank = 0;
+
+    explicit CopiesOn0(int own = 0) : rank(own) {}
+    CopiesOn0(const CopiesOn0& other) : rank(other.rank)
+    {
+        if (rank != 0)
+            throw std::runtime_error("no copy here");
+    }
+    CopiesOn0(CopiesOn0&&) = default;
+    CopiesOn0& operator=(const CopiesOn0&) = default;
+    void process(dfb::PixelTile&) const {}
+};
+
+} // namespace
+
+TEST_CASE("A pixel operation that cannot be copied on one rank: the others learn of it", "[errors]")
+{
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](const dfb::InprocCommunicator& communicator) {
+        const auto connection = dfb::connect<dfb::InprocTransport>(communicator); // lives on after the exception
+        texts[static_cast<std::size_t>(communicator.rank())] = outcomeOf([&] {
+            FrameBuffer<Blend, CopiesOn0>(connection, configOf(scene::makeScene(1)), CopiesOn0(communicator.rank()));
+        });
+    });
+    INFO(joined(texts));
+    CHECK(has(texts[0], "TransportError: dfb: transport failure: rank 1: no copy here"));
+    CHECK(has(texts[1], "exception: no copy here"));
+}
+
 namespace {
 
 struct ThrowingEye : dfb::PerspectiveCamera {

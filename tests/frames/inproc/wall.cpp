@@ -47,6 +47,20 @@ TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
     }
 }
 
+TEST_CASE("A ToWall without a wall fails the frame on every rank", "[wall]")
+{
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::ToWall, dfb::InprocTransport> fb(communicator,
+                                                                                                       {64, 64});
+        texts[static_cast<std::size_t>(fb.rank())] =
+            scene::outcomeOf([&] { dfb::ImageParallelLoop(fb).render([](auto&) {}); });
+    });
+    CHECK(texts[0] == texts[1]);
+    CHECK(scene::has(texts[0], "FrameError: "));
+    CHECK(scene::has(texts[0], "ToWall without a DisplayWall"));
+}
+
 TEST_CASE("A wall that is not finished for many frames drops the oldest, and says so", "[wall]")
 {
     const dfb::WallLayout layout{1, 1, 32, 32, 0, 0, {1}};

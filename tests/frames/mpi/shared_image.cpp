@@ -167,6 +167,47 @@ TEST_CASE("With half a level, ranks agree on how inputs come, whoever sees whom"
     }
 }
 
+TEST_CASE("After a frame with two owners of a tile the next frame is right", "[shared_image]")
+{
+    using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>>;
+    dfb::FrameBufferConfig config(64, 64);
+    config.quiet = std::chrono::milliseconds(50);
+    const auto sink = std::make_shared<PlaceSink>();
+    config.trace = sink;
+    Fb fb(MPI_COMM_WORLD, config);
+    if (seesNextRank(MPI_COMM_WORLD))
+        CHECK(waitForPlace(fb, *sink));
+    const int owner = 0, other = 1;
+    const auto tile = std::make_unique<Fb::Tile>();
+    bool isWrong = false;
+    const auto frame = [&](bool disagrees) {
+        dfb::FrameConfig params;
+        const int mine = disagrees && fb.rank() == other ? other : owner;
+        params.owners = std::make_shared<const std::vector<int>>(fb.layout().tileCount(), mine);
+        auto open = fb.begin(params);
+        // The owner leaves most pixels to the background; the other rank covers them.
+        for (const int index : open.ownedTiles()) {
+            const float green[4] = {0, 1, 0, 1};
+            open.start(*tile, index);
+            if (mine == owner)
+                std::copy_n(green, 4, tile->color);
+            else
+                tile->fill(green, 1);
+            if (!disagrees || fb.rank() == other)
+                open.setTile(*tile);
+        }
+        open.end();
+        for (std::size_t i = 0; i < fb.image().pixelCount(); ++i) {
+            const bool isSet = i % 16 == 0 && i / 64 % 16 == 0;
+            isWrong = isWrong || fb.image().rgba8()[4 * i + 1] != (isSet ? 255 : 0);
+        }
+    };
+    frame(false);
+    CHECK_THROWS_AS(frame(true), dfb::FrameError);
+    frame(false);
+    CHECK(!isWrong);
+}
+
 TEST_CASE("From an owner that does not leave the image is taken away", "[shared_image]")
 {
     if (sizeOf(MPI_COMM_WORLD) == 1 || !seesNextRank(MPI_COMM_WORLD))

@@ -1,7 +1,7 @@
 // The file that is compiled with dfb::compiled; see headers.cpp.
 #define DFB_COMPILED
+#include <dfb/comm/connection.hpp>
 #include <dfb/comm/inproc_transport.hpp>
-#include <dfb/frame/engine.hpp>
 
 int compiled();
 
