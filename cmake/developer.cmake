@@ -55,7 +55,7 @@ function(_dfb_reuse folder)
     elseif(options OR "OpenMP::OpenMP_CXX" IN_LIST libraries OR type MATCHES "^(MODULE|SHARED)_LIBRARY$")
       continue() # other flags
     elseif(type STREQUAL "STATIC_LIBRARY"
-        OR target MATCHES "^(test_(unit|fuzz_.*)|dfb_(check|compare|make|fuzz|render_stopped).*)$")
+        OR target MATCHES "^(test_(unit|fuzz_(fragment|finished|packet|tracker|readers|driver))|dfb_(check|compare|make|fuzz|render_stopped).*)$")
       continue() # they include a few of dfb's headers: reading all takes longer
     elseif("dfb_catch" IN_LIST libraries OR "Catch2::Catch2" IN_LIST libraries)
       set(header dfb_precompiled_tests)

@@ -188,17 +188,9 @@ private:
     using Vec = std::array<double, 3>;
 
     static constexpr double elevation = 0.4;
-    Vec forward() const
-    {
-        return {-std::cos(azimuth_) * std::cos(elevation), -std::sin(azimuth_) * std::cos(elevation),
-                -std::sin(elevation)};
-    }
-    Vec right() const { return {-std::sin(azimuth_), std::cos(azimuth_), 0}; }
-    Vec up() const
-    {
-        return {-std::cos(azimuth_) * std::sin(elevation), -std::sin(azimuth_) * std::sin(elevation),
-                std::cos(elevation)};
-    }
+    const Vec& forward() const { return axes_[0]; }
+    const Vec& right() const { return axes_[1]; }
+    const Vec& up() const { return axes_[2]; }
 
     // The lower corner of a brick of the cube [-1, 1]^3, and its size along an axis.
     double lower(int rank, std::size_t axis) const
@@ -254,6 +246,11 @@ private:
     }
 
     double azimuth_;
+    std::array<Vec, 3> axes_{
+        {{-std::cos(azimuth_) * std::cos(elevation), -std::sin(azimuth_) * std::cos(elevation), -std::sin(elevation)},
+         {-std::sin(azimuth_), std::cos(azimuth_), 0},
+         {-std::cos(azimuth_) * std::sin(elevation), -std::sin(azimuth_) * std::sin(elevation),
+          std::cos(elevation)}}}; // of the camera: forward, right and up
     std::array<int, 3> cells_;
 };
 

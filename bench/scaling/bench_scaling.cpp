@@ -2,7 +2,8 @@
 // ranks that are threads of this process, beside the formulas of bench/README.md, of which they must not differ; then
 // an estimate of a frame's time on up to 16,384 ranks in the LogGP model, beside binary swap and radix-k. No MPI.
 //   bench_scaling [--ranks 2,4,...] [--size 2048x2048] [--scenes bricks,discs] [--frames 3] [--quick]
-//   [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] [--table FILE] [--trace FILE]
+//   [--counts-only] [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] [--table FILE]
+//   [--trace FILE]
 //   [--commit ID]
 // `bricks`: each rank one brick of a cube, whose image is the smaller the more ranks there are. `discs`: each rank a
 // disc that is as large whatever their number. L, o and g are in us, G in ns a byte. --trace: of the first scene, with
@@ -485,7 +486,7 @@ struct Options {
     std::vector<int> ranks;
     std::vector<std::string> scenes{"bricks", "discs"};
     int width = 0, height = 0, frames = 3;
-    bool quick = false;
+    bool quick = false, countsOnly = false;
     // As measured between 4 hosts as network namespaces of one machine, 1 Gbit/s, 50 us.
     Network rig{"rig", 53, 14.4, 26, 8.5e-3};
     // Those that the scripts of ATLAHS (github.com/spcl/atlahs) give to LogGOPSim for links of 200 Gbit/s.
@@ -503,7 +504,8 @@ public:
     {
         for (const std::string& scene : o_.scenes)
             count(scene);
-        estimate();
+        if (!o_.countsOnly)
+            estimate();
         bench::appendJson(o_.json, results_);
         std::printf("\n%s\n", failures_ == 0 ? "All counts are those of the formulas."
                                              : "SOME COUNTS ARE NOT THOSE OF THE FORMULAS.");
@@ -729,8 +731,10 @@ Options optionsOf(int argc, char** argv)
     bench::readOptions(
         argc, argv,
         "usage: bench_scaling [--ranks 2,4,...] [--size WxH, multiples of 64] [--scenes bricks,discs] [--frames N] "
-        "[--quick] [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] [--table FILE] "
+        "[--quick] [--counts-only] [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] "
+        "[--table FILE] "
         "[--trace FILE] [--commit ID]\n"
+        "  --counts-only without the estimate\n"
         "  --rig, --hpc  a network of 1 Gbit/s and one of a cluster: latency, overhead and gap of a message in us, "
         "and\n"
         "                ns a byte\n"
@@ -750,7 +754,7 @@ Options optionsOf(int argc, char** argv)
          {"--table", bench::readText(o.table)},
          {"--trace", bench::readText(o.trace)},
          {"--commit", bench::readText(o.commit)}},
-        {{"--quick", &o.quick}});
+        {{"--quick", &o.quick}, {"--counts-only", &o.countsOnly}});
     if (o.ranks.empty())
         o.ranks =
             o.quick ? std::vector<int>{2, 8, 64, 256} : std::vector<int>{2, 4, 8, 16, 32, 64, 128, 256, 512, 1024};

@@ -1,7 +1,7 @@
 // The work that a frame skips: its cost as less of the image is active, and the work that is left out altogether. Each
 // claim is a line: what was measured, its limit, and whether it holds. 4 ranks are threads of this process; no MPI.
-//   bench_skip [--size 1024x1024] [--frames 12] [--quick] [--json FILE] [--svg FILE] [--table FILE] [--commit ID]
-//   bench_skip --frames-of full|empty [--frames N] [--size ...] [--trace FILE]
+//   bench_skip [--size 1024x1024] [--frames 12] [--quick] [--counts-only] [--json FILE] [--svg FILE] [--table FILE]
+//   [--commit ID] bench_skip --frames-of full|empty [--frames N] [--size ...] [--trace FILE]
 //                                                       N frames of that and nothing else, for profilers
 // The exit status is 1 if a claim of counts does not hold. Times are shown, as a machine may have other work.
 #include "clip.hpp"
@@ -406,7 +406,7 @@ Sampling sample(int width, int height)
 
 struct Options {
     int width = 1024, height = 1024, frames = 0;
-    bool quick = false;
+    bool quick = false, countsOnly = false;
     std::string framesOf, json, svg, table, trace, commit;
 };
 
@@ -419,7 +419,8 @@ public:
         measureShares();
         measureDeclarations();
         measureChannels();
-        measureOpaque();
+        if (!o_.countsOnly)
+            measureOpaque();
         measureConverged();
         const std::string title = "Claims, " + sizeText();
         claims_.print(title);
@@ -622,9 +623,11 @@ Options optionsOf(int argc, char** argv)
     };
     bench::readOptions(
         argc, argv,
-        "usage: bench_skip [--size WxH] [--frames N] [--quick] [--json FILE] [--svg FILE] [--table FILE] [--commit "
+        "usage: bench_skip [--size WxH] [--frames N] [--quick] [--counts-only] [--json FILE] [--svg FILE] [--table "
+        "FILE] [--commit "
         "ID]\n"
         "       bench_skip --frames-of full|empty [--size WxH] [--frames N] [--trace FILE]\n"
+        "  --counts-only  without the claims that the exit status does not depend on: those of opaque inputs\n"
         "  --frames-of  renders so many frames of a full or an empty image and measures nothing: for a profiler",
         {{"--size", [&o](const std::string& value) { return bench::readSize(value, o.width, o.height); }},
          {"--frames", bench::readNumber(o.frames, 1)},
@@ -634,7 +637,7 @@ Options optionsOf(int argc, char** argv)
          {"--table", bench::readText(o.table)},
          {"--trace", bench::readText(o.trace)},
          {"--commit", bench::readText(o.commit)}},
-        {{"--quick", &o.quick}});
+        {{"--quick", &o.quick}, {"--counts-only", &o.countsOnly}});
     if (o.frames == 0)
         o.frames = o.quick ? 4 : 12;
     return o;

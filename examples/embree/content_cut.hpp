@@ -141,8 +141,7 @@ private:
 
     void addVolume(std::vector<double>& content, const VolumeObject& object, double samplesPerLength) const
     {
-        const VisibleVoxels visible =
-            object.source.visible ? *object.source.visible : visibleVoxels(object.source); // generated: none yet
+        const VisibleVoxels& visible = *object.source.visible;
         std::size_t i = 0;
         for (int z = 0; z < visible.blocks[2]; ++z)
             for (int y = 0; y < visible.blocks[1]; ++y)

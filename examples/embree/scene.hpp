@@ -126,7 +126,9 @@ struct Scene {
         if (!object.source.look.isovalues.empty())
             object.geometry = nextGeometry_++;
         grow(object.bounds());
-        const VisibleVoxels visible = object.source.visible ? *object.source.visible : visibleVoxels(object.source);
+        if (!object.source.visible) // generated
+            object.source.visible = visibleVoxels(object.source);
+        const VisibleVoxels& visible = *object.source.visible;
         const float slack = static_cast<float>(visible.slack) * object.placement.largest();
         lookAt([&](const auto& take) {
             bool isEmpty = true;

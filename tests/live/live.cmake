@@ -15,7 +15,8 @@ endif()
 find_package(nlohmann_json CONFIG REQUIRED)
 find_package(PNG REQUIRED)
 dfb_add_unit_test(live SOURCES live/server.cpp LABELS example WAIT server)
-set_tests_properties(live.server PROPERTIES ${_undisturbed}) # it measures how long the end of a job takes
+add_test(NAME live.server.end COMMAND test_live ${_select} "[#server][end]")
+set_tests_properties(live.server.end PROPERTIES LABELS example ${_undisturbed})
 target_link_libraries(test_live PRIVATE dfb_live PkgConfig::DFB_HTTPLIB PkgConfig::DFB_TURBOJPEG PNG::PNG
   nlohmann_json::nlohmann_json)
 

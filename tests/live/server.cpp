@@ -601,7 +601,8 @@ TEST_CASE("several viewers see the same pictures")
     }
 }
 
-TEST_CASE("the end of a job is told to its viewers, and waits for none that is dead")
+// By itself, as it measures how long the end of a job takes: see live.cmake.
+TEST_CASE("the end of a job is told to its viewers, and waits for none that is dead", "[.][end]")
 {
     int port = 0, status = 0;
     bool isSent = false;

@@ -35,26 +35,32 @@ Count check(const Camera& camera, std::uint64_t seed)
     const int width = 120, height = 90;
     const dfb::TileLayout layout(width, height, 8);
     Count count;
-    for (int i = 0; i < 60; ++i) {
-        const dfb::Vec3 center = point(random, 2.5);
-        const auto extent = static_cast<float>(std::pow(10.0, uniform(random, -1.5, 0)));
-        const dfb::Vec3 half{extent, 0.4f * extent, 0.7f * extent};
-        const dfb::Box3 box{center - half, center + half};
-        std::set<int> found;
-        for (const auto& pair : dfb::visibleTiles(dfb::World({{1, box}}), camera, layout))
-            found.insert(pair.tile);
-        count.tiles += found.size();
-        count.all += static_cast<std::size_t>(layout.tileCount());
-        for (int k = 0; k < 30000; ++k) {
+    for (int round = 0; round < 10; ++round) {
+        std::vector<dfb::Box3> boxes;
+        std::vector<std::set<int>> found;
+        for (int i = 0; i < 6; ++i) {
+            const dfb::Vec3 center = point(random, 2.5);
+            const auto extent = static_cast<float>(std::pow(10.0, uniform(random, -1.5, 0)));
+            const dfb::Vec3 half{extent, 0.4f * extent, 0.7f * extent};
+            boxes.push_back({center - half, center + half});
+            found.emplace_back();
+            for (const auto& pair : dfb::visibleTiles(dfb::World({{1, boxes.back()}}), camera, layout))
+                found.back().insert(pair.tile);
+            count.tiles += found.back().size();
+            count.all += static_cast<std::size_t>(layout.tileCount());
+        }
+        for (int k = 0; k < 30000; ++k) { // most of the time goes into the rays, so each meets six boxes
             const double x = uniform(random, 0, width), y = uniform(random, 0, height);
             const dfb::LensSample sample{uniform(random, 0, 1), uniform(random, 0, 1), uniform(random, 0, 1)};
             const dfb::Ray ray = camera.ray(x, y, width, height, sample);
             if (ray.direction.x == 0 && ray.direction.y == 0 && ray.direction.z == 0)
                 continue;
-            if (!meets(ray.origin, ray.direction, box))
-                continue;
-            ++count.hits;
-            count.missed += found.count(layout.tileAt(static_cast<int>(x) / 8, static_cast<int>(y) / 8)) == 0;
+            const int tile = layout.tileAt(static_cast<int>(x) / 8, static_cast<int>(y) / 8);
+            for (std::size_t i = 0; i < boxes.size(); ++i)
+                if (meets(ray.origin, ray.direction, boxes[i])) {
+                    ++count.hits;
+                    count.missed += found[i].count(tile) == 0;
+                }
         }
     }
     return count;

@@ -172,13 +172,15 @@ TEST_CASE("A footprint meets the tiles that the box projects to, and no others",
         pairs += static_cast<int>(found.size());
         for (int tile = 0; tile < layout.tileCount(); ++tile) {
             const dfb::Region r = layout.region(tile);
-            double nearest = 1e9;
+            const bool isFound = found.count(tile) != 0;
+            double nearest = 1e9; // of a tile that was not found it matters only whether it is 0
             for (const auto& [x, y] : points) {
                 const double dx = std::max({0.0, r.x0 - x, x - r.x1}), dy = std::max({0.0, r.y0 - y, y - r.y1});
-                nearest = std::min(nearest, std::hypot(dx, dy));
+                if (isFound || (dx == 0 && dy == 0))
+                    nearest = std::min(nearest, std::hypot(dx, dy));
             }
-            missed += nearest == 0 && found.count(tile) == 0;
-            superfluous += nearest > between + 0.2 && found.count(tile) != 0;
+            missed += nearest == 0 && !isFound;
+            superfluous += nearest > between + 0.2 && isFound;
             saved += found.count(tile) == 0 && x0 < r.x1 && x1 > r.x0 && y0 < r.y1 && y1 > r.y0;
         }
     }

@@ -59,7 +59,7 @@ static_assert(std::has_unique_object_representations_v<Label>);
 
 inline constexpr std::uint64_t testMagic = 0x74736574'6266640au, controlMagic = 0x6c727463'6266640au;
 
-// Calls `visit(place, bytes, count)` for each piece of the content, up to 8 bytes long.
+// Calls `visit(place, bytes, count)` for each piece of the content, up to 1 KiB long.
 template <class Visit>
 void forContent(const Label& label, std::uint64_t seed, const Visit& visit)
 {
@@ -68,12 +68,14 @@ void forContent(const Label& label, std::uint64_t seed, const Visit& visit)
         visit(std::size_t{0}, reinterpret_cast<const unsigned char*>(&label), sizeof label);
         place = sizeof label;
     }
-    std::uint64_t state = mix(seed ^ label.sum());
+    std::uint64_t state = mix(seed ^ label.sum()), words[128];
     while (place < label.size) {
-        state = state * 6364136223846793005u + 1442695040888963407u;
-        const std::uint64_t word = state ^ (state >> 31);
-        const std::size_t count = std::min(sizeof word, static_cast<std::size_t>(label.size) - place);
-        visit(place, reinterpret_cast<const unsigned char*>(&word), count);
+        for (std::uint64_t& word : words) {
+            state = state * 6364136223846793005u + 1442695040888963407u;
+            word = state ^ (state >> 31);
+        }
+        const std::size_t count = std::min(sizeof words, static_cast<std::size_t>(label.size) - place);
+        visit(place, reinterpret_cast<const unsigned char*>(words), count);
         place += count;
     }
 }

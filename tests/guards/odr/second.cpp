@@ -1,7 +1,0 @@
-#include <dfb/dfb.hpp>
-#include <dfb/trace_file.hpp>
-
-int second()
-{
-    return 0;
-}
