@@ -251,8 +251,9 @@ public:
 
     // Writes the file on rank 0, and forgets the events, even if that fails. Collective, outside frames, on the thread
     // that begins frames. Waits for all ranks, without a time-out. `fb`: one of the framebuffers, or an
-    // ImageCompositor. Each rank gets the events of all, and needs memory for them. Throws InvalidArgument on all ranks
-    // if the file cannot be written; TransportError; and std::bad_alloc on a rank that lacks memory.
+    // ImageCompositor. Rank 0 needs memory for the events of all ranks, each other rank for those of one more. Throws
+    // InvalidArgument on all ranks if the file cannot be written; TransportError; and std::bad_alloc on a rank that
+    // lacks memory.
     template <class FrameBuffer>
     void write(FrameBuffer& fb, const std::string& path)
     {
@@ -263,7 +264,13 @@ public:
         constexpr int rounds = 20; // of messages to compare clocks by: the quickest ones tell most
         for (int round = 0; round < rounds; ++round)
             fb.allGather({});
-        const std::vector<std::vector<std::byte>> parts = fb.allGather(take());
+        const std::vector<std::byte> mine = take();
+        std::vector<std::vector<std::byte>> parts; // on rank 0
+        for (int rank = 0; rank < fb.size(); ++rank) {
+            std::vector<std::vector<std::byte>> one = fb.allGather(rank == fb.rank() ? mine : std::vector<std::byte>());
+            if (fb.rank() == 0)
+                parts.push_back(std::move(one[static_cast<std::size_t>(rank)]));
+        }
         std::vector<std::byte> failed;
         if (fb.rank() == 0) {
             std::ofstream file(path);
@@ -276,7 +283,9 @@ public:
             if (!file)
                 failed.emplace_back();
         }
-        if (!fb.allGather(failed).front().empty())
+        const bool isWritten = fb.allGather(failed).front().empty();
+        take(); // those of this call
+        if (!isWritten)
             detail::failArgument("%s: cannot be written", path.c_str());
     }
 

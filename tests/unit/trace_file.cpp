@@ -22,17 +22,23 @@ struct LoneRank {
     std::vector<Bytes> ofOthers{};    // the parts of the ranks after it
     Bytes given{};                    // the last that was not empty
     dfb::TraceFile* traced = nullptr; // gets an event at each call
+    std::size_t turn = 0;             // of ofOthers: they give theirs one after the other, after this rank
 
     int rank() const { return number; }
+    int size() const { return number + 1 + static_cast<int>(ofOthers.size()); }
     std::vector<Bytes> allGather(const Bytes& mine)
     {
         if (traced)
             traced->add({});
-        if (mine.empty())
-            return std::vector<Bytes>(1 + ofOthers.size());
-        given = mine;
-        std::vector<Bytes> all{mine};
-        all.insert(all.end(), ofOthers.begin(), ofOthers.end());
+        std::vector<Bytes> all(static_cast<std::size_t>(size()));
+        const auto own = all.begin() + number;
+        *own = mine;
+        if (!mine.empty())
+            given = mine;
+        else if (!given.empty() && turn < ofOthers.size()) {
+            *(own + 1 + static_cast<std::ptrdiff_t>(turn)) = ofOthers[turn];
+            ++turn;
+        }
         return all;
     }
 };
