@@ -42,9 +42,9 @@ struct NetworkConfig {
     bool sharedMemory = true;
     // A rank counts as lost if no message has come from it for this long while messages are expected. It may have
     // ended, hang, or be out of reach. Needs a progress thread on both ranks. 0: this rank watches no other, and no
-    // other watches it. Otherwise 100 ms to 24 days; framebuffers refuse other values. It also limits how long a
-    // reduction waits after a message that could not be read; for this 0 means no limit, unless the frame has a
-    // time-out.
+    // other watches it. Otherwise 100 ms to 24 days; framebuffers refuse other values. Below 400 ms it must be the same
+    // on all ranks. It is also the time-out of a reduction after a message that could not be read; for this 0 means no
+    // limit, unless the frame has a time-out.
     std::chrono::milliseconds peerTimeout = defaultPeerTimeout;
     // Called once when a rank is lost, on one or several of the others, by a thread of the library or the one that
     // destroys the connection. It must be quick and not throw. All ranks then get a TransportError with the lost rank
@@ -493,11 +493,11 @@ private:
         return isOn ? config_.peerTimeout : std::chrono::milliseconds(0);
     }
 
-    // Short enough to answer a Ping in time.
+    // Short enough to answer a Ping in time, also to a rank with a shorter time-out, down to 400 ms.
     Clock::duration longestNap() const
     {
-        const Clock::duration longest = std::chrono::seconds(1);
-        return heartbeat_.isOn() ? std::min(longest, heartbeat_.patience()) : longest;
+        const Clock::duration longest = std::chrono::milliseconds(250);
+        return heartbeat_.isOn() ? std::min(longest, heartbeat_.patience()) : std::chrono::seconds(1);
     }
 
     void sendSign(int other, detail::MessageKind kind)

@@ -421,15 +421,18 @@ public:
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, const char* how, Operation operation)
     {
         Bytes mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
-        for (const std::int64_t value : values)
-            mine.put(value);
+        std::vector<std::int64_t> reduced;
+        makePart([&] {
+            for (const std::int64_t value : values)
+                mine.put(value);
+            reduced.resize(values.size());
+        });
         const auto combine = [operation](ByteReader& a, ByteReader& b, Bytes& out) {
             while (a.left() > 0) {
                 const auto x = a.get<std::int64_t>(), y = b.get<std::int64_t>();
                 out.put(operation(x, y));
             }
         };
-        std::vector<std::int64_t> reduced(values.size());
         reduceParts(std::move(mine), combine, [&](ByteReader& in) {
             for (std::int64_t& value : reduced)
                 value = in.get<std::int64_t>();

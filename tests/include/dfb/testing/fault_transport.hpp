@@ -128,7 +128,7 @@ public:
         const std::uint64_t number = numbers_[static_cast<std::size_t>(destination)]++;
         ++counts_->sent;
         FaultDecision decision;
-        if (!options_.only || options_.only(destination, message))
+        if (!isStopping_ && (!options_.only || options_.only(destination, message)))
             decision = decideFault(options_, rank(), destination, number);
         if (decision.drop && lethalLeft_-- > 0) {
             ++counts_->dropped;
@@ -182,8 +182,10 @@ public:
 
     void stop(bool orderly)
     {
-        if (orderly)
+        if (orderly) {
+            isStopping_ = true; // base_ polls from now on, so nothing that the handler sends may be held back
             release(true);
+        }
         base_.stop(orderly);
     }
 
@@ -279,6 +281,7 @@ private:
     std::vector<std::atomic<std::uint64_t>> numbers_; // of messages so far, per destination
     std::atomic<std::int64_t> lethalLeft_;            // none if negative
 
+    std::atomic<bool> isStopping_{false};
     std::mutex mutex_;
     std::vector<Held> held_;                // under mutex_
     std::atomic<std::size_t> heldCount_{0}; // how many are in held_ or on their way from it to base_
