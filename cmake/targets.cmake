@@ -12,9 +12,11 @@ function(_dfb_add_component name)
   set_target_properties(dfb_${name} PROPERTIES EXPORT_NAME ${name})
 endfunction()
 
-# Calls find_package, and ends with an error if nothing is found.
+# Calls find_package, unless the project above has such a target, and ends with an error if nothing is found.
 macro(_dfb_require option packages target)
-  find_package(${ARGN} QUIET)
+  if(NOT TARGET ${target})
+    find_package(${ARGN} QUIET)
+  endif()
   if(NOT TARGET ${target})
     message(FATAL_ERROR "dfb: ${ARGV3} was not found. Install it (Debian and Ubuntu: apt-get install ${packages}), "
       "or leave it out with -D${option}=OFF.")

@@ -73,6 +73,9 @@ foreach(_how add_subdirectory FetchContent)
   endforeach()
   if(_how STREQUAL "add_subdirectory")
     list(APPEND _options -Ddfb_ROOT=${_stage} -DDFB_INSTALL=ON)
+  elseif(TARGET dfb::tbb)
+    list(APPEND _options -DOWN_TBB=$<TARGET_FILE:TBB::tbb>
+      "-DOWN_TBB_INCLUDE=$<TARGET_PROPERTY:TBB::tbb,INTERFACE_INCLUDE_DIRECTORIES>")
   endif()
   dfb_add_package_test(${_how} HOW ${_how} EXPECT ${_others} OPTIONS ${_options})
 endforeach()
@@ -95,14 +98,13 @@ foreach(_component IN LISTS _others)
 endforeach()
 
 # The library compiled once, by the user's project: from the package and, with core alone, from the sources. With MPI it
-# also builds a program that was written from the documentation alone.
-set(_door "")
+# also builds a program that was written from the documentation alone, and renders frames.
+set(_frame -DFRAME=ON)
 if(TARGET dfb::mpi)
-  set(_door -DDOOR=ON)
+  set(_frame -DDOOR=ON)
 endif()
-dfb_add_package_test(find_package_compiled HOW find_package EXPECT ${_others}
-  OPTIONS -DFRAME=ON -DCOMPILED=ON ${_door})
-if(_door)
+dfb_add_package_test(find_package_compiled HOW find_package EXPECT ${_others} OPTIONS -DCOMPILED=ON ${_frame})
+if(TARGET dfb::mpi)
   set_tests_properties(package.find_package_compiled PROPERTIES FIXTURES_SETUP dfb_door)
   dfb_add_mpi_run(package.door RANKS 1 3 LABELS package
     COMMAND ${CMAKE_CURRENT_BINARY_DIR}/package/find_package_compiled/door)
