@@ -1,4 +1,7 @@
 """FrameBuffer: bricks rendered by a function, blended by the library or by a function, beside the reference."""
+import subprocess
+import sys
+import time
 import unittest
 
 import numpy as np
@@ -97,6 +100,37 @@ class FrameBuffer(unittest.TestCase):
         image, depth = render(lambda inputs: over(inputs)[0], depth=True)
         assert_exact(image, expected)
         self.assertTrue(np.isinf(depth).all())
+
+    def test_one_at_a_time(self):
+        """No two calls of the functions are under way at once, also while one lets other threads have the GIL."""
+        inside, most = [], []
+
+        def alone(function):
+            def call(*arguments):
+                inside.append(None)
+                most.append(len(inside))
+                time.sleep(0.001)
+                result = function(*arguments)
+                inside.pop()
+                return result
+            return call
+
+        render(alone(over), 1, alone(draw), threads=4)
+        self.assertGreater(len(most), 12)
+        self.assertEqual(max(most), 1)
+
+    def test_fork(self):
+        """A process that is forked off ends without a call of the objects of the first one."""
+        program = """
+import os, sys, dfb
+with dfb.FrameBuffer(None, 64, 64) as left:
+    kept = dfb.FrameBuffer(None, 64, 64)
+    child = os.fork()
+    if child == 0:
+        sys.exit(0)
+    sys.exit(os.waitpid(child, 0)[1] != 0)
+"""
+        self.assertEqual(subprocess.run([sys.executable, "-c", program], timeout=60).returncode, 0)
 
     def test_inputs_of_an_operation(self):
         seen = []

@@ -20,6 +20,8 @@
 #include <string>
 #include <utility>
 
+#include <unistd.h>
+
 namespace dfb_python {
 
 // `Object`: dfb::ImageCompositor, or a class with the same members. Members are called with the GIL, and release it
@@ -35,7 +37,7 @@ public:
         views_.emplace(connection->pool());
         {
             const py::gil_scoped_release released;
-            object_ = make(std::move(connection));
+            object_.reset(make(std::move(connection)).release());
         }
         const auto& image = object_->config().image;
         rank_ = object_->rank(), size_ = object_->size(), displayRank_ = image.displayRank;
@@ -176,8 +178,19 @@ private:
         throw dfb::InvalidArgument(std::move(info));
     }
 
+    // Leaves the object alone in a process that was forked off: it has none of the threads that the end waits for.
+    struct EndInMaker {
+        pid_t maker = ::getpid();
+
+        void operator()(Object* object) const
+        {
+            if (::getpid() == maker)
+                delete object;
+        }
+    };
+
     dfb::FrameConfig frame_;
-    std::unique_ptr<Object> object_;
+    std::unique_ptr<Object, EndInMaker> object_;
     std::optional<ImageViews> views_;
     bool isInUse_ = false;
     int rank_ = 0, size_ = 1, displayRank_ = 0, width_ = 0, height_ = 0; // calls may replace the object's own

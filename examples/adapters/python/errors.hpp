@@ -8,6 +8,7 @@
 #include <cstdint>
 #include <exception>
 #include <memory>
+#include <mutex>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -98,6 +99,9 @@ public:
     // Returns it and forgets it, so that it does not keep its frames alive.
     py::object take() noexcept { return std::exchange(first_, py::none()); }
 
+    // For inTurn().
+    std::mutex turn;
+
 private:
     Cause() = default;
     py::object first_ = py::none();
@@ -132,6 +136,14 @@ void withPython(Cause& cause, const Body& body)
     }
     if (thrown)
         std::rethrow_exception(thrown);
+}
+
+// As withPython(), but for one body at a time of a call of the library: Python releases the GIL now and then.
+template <class Body>
+void inTurn(Cause& cause, const Body& body)
+{
+    const std::lock_guard<std::mutex> turn(cause.turn);
+    withPython(cause, body);
 }
 
 // Calls body() without the GIL, and returns its result. An exception of dfb becomes dfb.Error, whose cause is the

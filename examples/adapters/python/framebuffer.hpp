@@ -188,7 +188,7 @@ public:
         const NumpyOperation::FrameData data{object().function, cause};
         const auto& picture = object().config().image;
         const RenderBrick render = [&](const dfb::Brick& brick, RenderTile& tile) {
-            withPython(*cause, [&] {
+            inTurn(*cause, [&] {
                 const py::object given = py::cast(PythonTile(tile, picture.width, picture.height));
                 const py::object returned =
                     draw(objects[static_cast<std::size_t>(&brick - world.bricks().data())], given);

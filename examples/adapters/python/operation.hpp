@@ -57,7 +57,7 @@ public:
             std::sort(inputs_.begin(), inputs_.end(), [](const dfb::Fragment& a, const dfb::Fragment& b) {
                 return a.header().source < b.header().source;
             });
-            withPython(*data_.cause, [&] { call(out.wantsDepth(), colors, depths); });
+            inTurn(*data_.cause, [&] { call(out.wantsDepth(), colors, depths); });
         }
         inputs_.clear();
         for (std::size_t i = 0; i < colors.size(); i += 4) {

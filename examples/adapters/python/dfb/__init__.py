@@ -224,9 +224,9 @@ class ImageCompositor(_Collective):
         """Make a picture of the images of all ranks, and return its Report.
 
         rgba            premultiplied RGBA, (height, width, 4) of uint8 or float32, read in place; None: this rank has
-                        nothing. Rows may have gaps or be upside down (rgba[::-1]); their pixels lie one after another. Levels
+                        nothing. Rows may have gaps of whole pixels, or be upside down (rgba[::-1]); their pixels lie one after another. Levels
                         of uint8 count as level / 255, rounded to float32
-        depth           (height, width) of float32, which grows away from the eye; needed unless blend="order". Copied if its
+        depth           (height, width) of float32, which grows away from the eye; needed unless blend="order" without depth. Copied if its
                         rows lie differently from those of rgba, else read in place
         order           this rank's place, 0 in front, a different one on each rank: needed with blend="order" and
                         rgba, else ignored
