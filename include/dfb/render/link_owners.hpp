@@ -46,8 +46,12 @@ public:
     void add(int tile, const Region& pixels, const int* ranks, std::size_t rankCount)
     {
         const double share = areaOf(pixels) / static_cast<double>(rankCount);
-        for (std::size_t i = 0; i < rankCount; ++i)
-            addPart(tiles_[static_cast<std::size_t>(tile)], nodeOf(ranks[i]), share);
+        for (std::size_t i = 0, next = 0; i < rankCount; i = next) {
+            const int node = nodeOf(ranks[i]);
+            while (next < rankCount && nodeOf(ranks[next]) == node)
+                ++next;
+            addPart(tiles_[static_cast<std::size_t>(tile)], node, share * static_cast<double>(next - i));
+        }
     }
 
     // All ranks, node by node.
