@@ -68,8 +68,8 @@ struct FrameBufferConfig {
     // CallerExecutor makes no threads. Ranks may give different ones.
     std::shared_ptr<Executor> executor{};
     // onTile(tile index, its pixels, image), for windows that show a frame while it is made. Called on the display rank
-    // for each composited tile, when its pixels are in the image of the open frame. The library's operations, except
-    // Progressive, leave out a tile whose inputs are all empty, unless the pixel operation is not pointwise. Worker
+    // for each composited tile, when its pixels are in the image of the open frame. A tile without active pixels is
+    // left out if the operation is one of the library's (not Progressive) and the pixel operation is pointwise. Worker
     // threads call it, and your own threads in setTile(), poll(), loops and calls that wait, such as end(); for several
     // tiles at once, while other pixels of the image are still being written. It must be quick. An exception makes the
     // frame fail. For tiles whose owners are on the display rank's node, all calls may come at the end of the frame.
@@ -205,8 +205,8 @@ struct FrameReport : FrameSums {
     std::int64_t tilesTotal = 0;                // in the image
     WireFormat wireColor = WireFormat::Float32; // in which format this rank rounded inputs, see Precision
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
-    // All: how far colour and alpha of a pixel may be off because of Precision and minTransmittance. Depth, positions
-    // and ids are exact.
+    // All: how far colour and alpha of a pixel may be off because of Precision and minTransmittance, before the pixel
+    // operation. Depth, positions and ids are exact.
     double wireErrorBound = 0;
     double mergeErrorBound = 0;        // all: how far a pixel may be off because segments were merged, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports

@@ -219,9 +219,9 @@ public:
     Executor& executor() const noexcept { return *config().executor; }
 
     // On the display rank: the image of the last frame that ended well or partial. With config.framesInFlight = 1 it is
-    // valid until the next begin(); with n frames in flight, until the n-th begin() after that of its own frame. Empty
-    // before the first frame, when it is no longer valid, and on other ranks. Only the thread that begins and ends
-    // frames may call it.
+    // valid until the next begin(); with n frames in flight, until the n-th begin() after the one that began its frame.
+    // Empty before the first frame, when it is no longer valid, and on other ranks. Only the thread that begins and
+    // ends frames may call it.
     const Image& image() const noexcept { return lastEnded_->image(); }
 
     // Copies the display rank's image() to every rank, and returns it; an empty image if image() is empty there. The

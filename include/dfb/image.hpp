@@ -66,9 +66,8 @@ inline std::size_t bytesPerPixel(OutputFormat format) noexcept
 
 // Converts `count` linear premultiplied RGBA pixels, double or float, to `format`, and writes bytesPerPixel(format)
 // bytes each to `out`, rounded to nearest. `out` must have room for them and not overlap `rgba`; for RGBA32F it is
-// aligned to floats. Any thread. Returns the largest rounding distance in 8-bit levels, 0 to 1/2; 1/2 is a tie. It may
-// be up to 2^-15 too large. An sRGB colour next to a level's boundary counts as a tie; other sRGB colours do not count.
-// 0 for RGBA32F and None.
+// aligned to floats. Any thread. Returns how far the worst value was from its level, in levels: 0 to 1/2, a tie. It may
+// be up to 2^-15 too large. sRGB colours count only next to a boundary, and then as a tie. 0 for RGBA32F and None.
 template <class Real>
 double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out);
 
@@ -196,7 +195,8 @@ private:
 };
 
 // Writes the colours of an image to a file that most image viewers open: a PPM file, 8 bits a channel, without alpha.
-// RGBA32F becomes sRGB; 8-bit images are written as they are. Replaces an existing file. Not collective: call it on a
+// RGBA32F becomes sRGB; 8-bit images are written as they are. The first row of the image is the uppermost of the
+// picture, also after setBottomUp(). Replaces an existing file. Not collective: call it on a
 // rank that has an image. Any thread. Throws InvalidArgument if the image is empty, and then writes nothing, or if the
 // file cannot be written, which may leave a part of it.
 DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image);

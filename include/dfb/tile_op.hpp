@@ -40,9 +40,9 @@
 //                                                for them
 //   static constexpr bool keepsState = true;     the object keeps values of its tile from frame to frame. A tile may
 //                                                then have no pass in a frame: the image keeps its pixels. TileInfo
-//                                                tells which samples come now. While all samples of a tile are
-//                                                empty, its object is not called; the first newFrame() then has
-//                                                their number in TileInfo::emptySamples
+//                                                tells which samples come now. Until a tile has a sample that is
+//                                                not empty, its object is not called. Its first newFrame() then
+//                                                gets the number of empty samples in TileInfo::emptySamples
 //   static constexpr bool emptyIsBackground = true;   inputs without any pixel give the background: finish() is then
 //                                                not called and nothing is sent, if the pixel operation is pointwise
 //   void report(TileReport&) const;              after finish(): figures of the tile

@@ -29,7 +29,7 @@ struct Segment {
 // A tile whose pixels may have several segments, all of one brick. A segment is what the brick contributes along one
 // piece of a ray. Other bricks may have segments in the gaps between them. A pixel keeps at most `maxSegments`, which
 // bounds memory and messages. If one more is added, two neighbours are merged: those whose merge may change the pixel
-// least. A merge is exact unless another brick has something between the two. Then that layer (c', a') is blended
+// least. A merge is exact if no other brick lies between the two. Otherwise the layer between them (c', a') is blended
 // behind both. This puts the pixel off by T |c' a2 - c2 a'|, where (c2, a2) is the farther of the two, and T is the
 // part of the light that passes the brick's segments in front of it. This is at most T max(a2, |c2|) for colours with
 // c' <= a' <= 1. The sum over all merges bounds the error of a pixel: errorBound(). Where c' is more than a', multiply

@@ -41,13 +41,14 @@ enum class WireFormat : std::uint8_t {
 };
 
 // The largest error that may come from rounding inputs: the absolute difference of any colour or alpha value from its
-// value with Float32, in the float image, before that is converted to the output format.
+// value with Float32, in the float image, before a pixel operation and the conversion to the output format.
 struct ErrorBudget {
     double error = 0;
     float maxColor = 1; // see Precision
 };
 
-// For 8-bit images: a value may be off by half a level before the final rounding, so by at most one level after it.
+// For 8-bit images: a value may be off by half a level before the final rounding, so by at most one level after it. A
+// pixel operation may make more of it.
 // Only inputs that go to another node (to a rank that shares no memory with this one) are rounded, to the cheapest
 // format that keeps this bound. Everything else is exact, and so are float images. The image may therefore depend on
 // which ranks share a node.

@@ -203,12 +203,13 @@ ErrorReport compare(const TileInputs<tileSizeOf<Op>>& in, const std::vector<Pixe
 // Checks an operation of your own against the contract in tile_op.hpp, in one line: REQUIRE(checkTileOp<MyOp>() == "").
 // Returns a sentence for each fault, or nothing. The image must not depend on the order in which inputs come, nor on
 // the frame before. Each pixel must be set. An image of two passes must be the mean of the images of each. Empty inputs
-// must show the background. Inputs are random, half transparent, and have a depth. `label(header, layer)` may set the
-// generation and source that the operation expects; without it they are generation 1 and source `layer`. For operations
-// that keep no state.
+// must show the background. Inputs are random, half transparent, and have a depth, but no other channel. `label(header,
+// layer)` may set the generation and source that the operation expects; without it they are generation 1 and source
+// `layer`. For operations that keep no state.
 template <class Op, class Label>
 std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
 {
+    static_assert((Op::channels & ~(colorChannel | depthChannel)) == 0, "its inputs have colour and depth only");
     using Inputs = TileInputs<tileSizeOf<Op>>;
     constexpr int size = tileSizeOf<Op>, layers = 3;
     std::mt19937_64 random(seed);
