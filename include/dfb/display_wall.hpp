@@ -42,7 +42,8 @@ struct ToWall {
 //
 // Memory: for each display that it drives, a rank has the image that is shown, and one more for each frame (16 at most)
 // of which parts have come before its finish(). The constructor takes memory for one of these; if there is none for
-// another, the connection fails. At most `poolBytes` are on the way to such a rank.
+// another, the connection fails. At most `poolBytes` are on the way to such a rank. A frame without finish() keeps some
+// bytes on every rank until the next finish().
 class DisplayWall {
 public:
     // Makes a wall whose displays show images in `format`. `executor` runs its work; null: threads of its own, beside

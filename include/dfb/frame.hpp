@@ -180,8 +180,8 @@ struct FrameSums {
     std::int64_t alphaOutsidePixels = 0;   // finite input pixels whose alpha is not within [0, 1]
     std::int64_t orderUndefinedPixels = 0; // of finished tiles, see TileReport
     std::int64_t compressedLinks = 0;      // pairs of sender and receiver for which compression paid
-    // Messages with pixels that were dropped since the last verdict, because their frame had failed, or because an
-    // opaque input that came sooner hides them.
+    // Since the last verdict: messages with pixels that came after the end of their frame, and errors that came too
+    // late for it. Inputs that a frame drops after it has failed do not count.
     std::int64_t lateMessages = 0;
     std::int64_t repeatedMessages = 0; // messages that came twice and were dropped, since the last verdict
 };
