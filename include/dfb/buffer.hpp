@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <array>
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
@@ -140,11 +141,7 @@ public:
     }
 
     // Bytes taken from the system so far. The pool gives nothing back before its end, so this is its peak.
-    std::uint64_t peakBytes() const
-    {
-        std::lock_guard<std::mutex> lock(mutex_);
-        return heldBytes_;
-    }
+    std::uint64_t peakBytes() const noexcept { return heldBytes_; }
 
     bool mayBeShared() const noexcept { return mayBeShared_; }
 
@@ -225,7 +222,7 @@ private:
     mutable std::mutex mutex_;
     std::array<SizeClass, classCount> classes_;
     std::shared_ptr<SharedMemory> shared_;
-    std::uint64_t heldBytes_ = 0;
+    std::atomic<std::uint64_t> heldBytes_{0}; // written under mutex_
 };
 
 DFB_NAMESPACE_END

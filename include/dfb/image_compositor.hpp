@@ -151,21 +151,14 @@ public:
     // and after one that failed. Pixels that no image has show FrameConfig::background, at a depth of +infinity.
     const Image& image() const noexcept { return engine_->image(); }
 
-    // Collective, between pictures. Returns a copy of the display rank's image() on every rank; it is empty if image()
-    // is empty there. Takes memory for several more images on every rank while it runs. Waits for all ranks, without a
-    // time-out. Throws InvalidArgument on all ranks if one makes another collective call; TransportError; and
-    // std::bad_alloc on a rank that lacks memory.
+    // As DistributedFrameBuffer::imageOnAllRanks(), between pictures.
     Image imageOnAllRanks() { return engine_->imageOnAllRanks(*engine_); }
 
-    // Returns memory for an image that all ranks of the node can read, so that nobody has to copy it. It is not
-    // cleared, and aligned to 64 bytes. If there is no shared memory, or no more of it (4 GiB a rank), it is memory of
-    // this rank alone: pixels in it are then copied. After a TransportError do not write to it until the compositor is
-    // destroyed. Any thread. Waits for nothing. Throws OutOfMemory.
+    // As DistributedFrameBuffer::sharedMemory(): an image in it need not be copied. After a TransportError do not write
+    // to it until the compositor is destroyed.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
-    // Returns the bytes of each rank, by rank, on all ranks. `call` is the name of this call in the error that is
-    // thrown if ranks make different calls. The sizes may differ and may be 0. Collective, while no picture is open.
-    // Waits and throws as imageOnAllRanks().
+    // As DistributedFrameBuffer::allGather(), between pictures.
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call = "allGather()")
     {
         return engine_->allGather(bytes, call);

@@ -48,6 +48,16 @@ DFB_DETECTS(has_process_v, std::declval<const T&>().process(std::declval<PixelTi
 DFB_SETTING(bool, is_pointwise_v, false, pointwise);
 DFB_DETECTS(has_pixel_new_frame_v, std::declval<T&>().newFrame(std::declval<const typename FrameDataOf<T>::type&>()));
 
+template <class T>
+constexpr bool checkPixelOp()
+{
+    static_assert(std::is_copy_constructible_v<T>, "dfb: PixelOp must provide a copy constructor");
+    static_assert(has_process_v<T>, "dfb: PixelOp must provide void process(PixelTile&) const");
+    static_assert(std::is_same_v<typename FrameDataOf<T>::type, NoFrameData> || has_pixel_new_frame_v<T>,
+                  "dfb: a PixelOp with a FrameData must provide void newFrame(const FrameData&)");
+    return true;
+}
+
 } // namespace detail
 
 template <class T>
@@ -59,20 +69,6 @@ struct NoPixelOp {
     void process(PixelTile&) const noexcept {}
 };
 static_assert(is_pixel_op_v<NoPixelOp>);
-
-namespace detail {
-
-template <class T>
-constexpr bool checkPixelOp()
-{
-    static_assert(std::is_copy_constructible_v<T>, "dfb: PixelOp must provide a copy constructor");
-    static_assert(has_process_v<T>, "dfb: PixelOp must provide void process(PixelTile&) const");
-    static_assert(std::is_same_v<typename FrameDataOf<T>::type, NoFrameData> || has_pixel_new_frame_v<T>,
-                  "dfb: a PixelOp with a FrameData must provide void newFrame(const FrameData&)");
-    return is_pixel_op_v<T>;
-}
-
-} // namespace detail
 
 // Exposure, then Reinhard's global operator on the colour divided by alpha: c -> k c / (1 + k c), c = colour / alpha
 // (Reinhard et al., "Photographic Tone Reproduction for Digital Images", 2002, equation 3). Alpha stays. In pixels

@@ -300,15 +300,6 @@ DFB_DETECTS(has_channels_v, std::enable_if_t<std::is_convertible_v<decltype(T::c
 DFB_DETECTS(has_is_complete_v,
             std::enable_if_t<std::is_same_v<bool, decltype(std::declval<const T&>().isComplete())>, bool>{});
 
-} // namespace detail
-
-template <class T>
-inline constexpr bool is_tile_op_v =
-    std::is_default_constructible_v<T>&& detail::has_channels_v<
-        T> && (detail::has_new_frame_v<T> || detail::has_new_frame_with_data_v<T>)&&detail::has_add_v<T>&& detail::has_finish_v<T>;
-
-namespace detail {
-
 // One readable line per member that is missing.
 template <class T>
 constexpr bool checkTileOp()
@@ -328,10 +319,15 @@ constexpr bool checkTileOp()
     if constexpr (active_by_depth_v<T>)
         static_assert((T::channels & needed_channels_v<T> & depthChannel) != 0,
                       "dfb: a TileOp with activeByDepth must have depthChannel in channels and neededChannels");
-    return is_tile_op_v<T>;
+    return true;
 }
 
 } // namespace detail
+
+template <class T>
+inline constexpr bool is_tile_op_v =
+    std::is_default_constructible_v<T>&& detail::has_channels_v<
+        T> && (detail::has_new_frame_v<T> || detail::has_new_frame_with_data_v<T>)&&detail::has_add_v<T>&& detail::has_finish_v<T>;
 
 DFB_NAMESPACE_END
 

@@ -281,6 +281,27 @@ inline void resetOrder(std::vector<int>& order, std::size_t count)
     std::iota(order.begin(), order.end(), 0);
 }
 
+// keepNearest() for layers of colour and depth alone.
+inline void keepNearestPlain(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
+{
+    const auto first = static_cast<std::size_t>(x);
+    for (int i = 0; i < count; ++i) {
+        const float* color = layers.front().color;
+        float depth = layers.front().depth[i];
+        for (std::size_t k = 1; k < layers.size(); ++k) {
+            const bool isNearer = layers[k].depth[i] < depth;
+            color = isNearer ? layers[k].color : color;
+            depth = isNearer ? layers[k].depth[i] : depth;
+        }
+        const std::size_t at = first + static_cast<std::size_t>(i);
+        for (std::size_t c = 0; c < 4; ++c)
+            row.rgba[4 * at + c] = 0.0 + static_cast<double>(color[4 * static_cast<std::size_t>(i) + c]); // -0 is 0
+        row.transmittance[at] = 1.0 - row.rgba[4 * at + 3];
+        if (row.wantsDepth)
+            row.depth[at] = depth;
+    }
+}
+
 } // namespace detail
 
 // Composites `count` pixels of the layers into `row` at [x, x + count), in the order of `layers`, whatever their depth.
@@ -323,31 +344,6 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
         begin = end;
     }
 }
-
-namespace detail {
-
-// keepNearest() for layers of colour and depth alone.
-inline void keepNearestPlain(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
-{
-    const auto first = static_cast<std::size_t>(x);
-    for (int i = 0; i < count; ++i) {
-        const float* color = layers.front().color;
-        float depth = layers.front().depth[i];
-        for (std::size_t k = 1; k < layers.size(); ++k) {
-            const bool isNearer = layers[k].depth[i] < depth;
-            color = isNearer ? layers[k].color : color;
-            depth = isNearer ? layers[k].depth[i] : depth;
-        }
-        const std::size_t at = first + static_cast<std::size_t>(i);
-        for (std::size_t c = 0; c < 4; ++c)
-            row.rgba[4 * at + c] = 0.0 + static_cast<double>(color[4 * static_cast<std::size_t>(i) + c]); // -0 is 0
-        row.transmittance[at] = 1.0 - row.rgba[4 * at + 3];
-        if (row.wantsDepth)
-            row.depth[at] = depth;
-    }
-}
-
-} // namespace detail
 
 // For each of `count` pixels, keeps the nearest layer, by (depth, index in `layers`), and puts it into `row` at
 // [x, x + count). This is for opaque inputs. Pixels with alpha 0 count as well, also for depth, position and ids, as

@@ -13,6 +13,7 @@
 #include <dfb/comm/message.hpp>
 
 #include <algorithm>
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <functional>
@@ -123,11 +124,7 @@ public:
     }
 
     // Bytes that were given to send() and that, as far as is known, no receiver has taken out of its inbox.
-    std::size_t underWay() const
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return underWay_;
-    }
+    std::size_t underWay() const noexcept { return underWay_; }
 
     // A text that says which ranks have not taken how many bytes.
     std::string notTaken() const
@@ -181,7 +178,7 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         inboxBytes_ += byteCount;
-        peakInboxBytes_ = std::max(peakInboxBytes_, inboxBytes_);
+        peakInboxBytes_ = std::max(peakInboxBytes_.load(), inboxBytes_);
     }
 
     // A message that has arrived is of another epoch, and has been thrown away.
@@ -228,11 +225,7 @@ public:
     }
 
     // The most that was in the inbox at one time in this epoch.
-    std::size_t peakInboxBytes() const
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return peakInboxBytes_;
-    }
+    std::size_t peakInboxBytes() const noexcept { return peakInboxBytes_; }
 
 private:
     struct Outgoing {
@@ -334,8 +327,9 @@ private:
     std::unordered_map<int, Peer> peers_;
     Fifo<int> asking_;
     Fifo<std::pair<int, Credit>> grants_; // not yet sent to their ranks
-    std::size_t underWay_ = 0, inboxBytes_ = 0, peakInboxBytes_ = 0;
-    std::function<bool(const Buffer&)> matters_; // null: all messages matter
+    std::size_t inboxBytes_ = 0;
+    std::atomic<std::size_t> underWay_{0}, peakInboxBytes_{0}; // may be read without it
+    std::function<bool(const Buffer&)> matters_;               // null: all messages matter
     Callbacks callbacks_;
 };
 

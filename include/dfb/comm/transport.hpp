@@ -156,14 +156,6 @@ Progress resolved(Progress progress, [[maybe_unused]] const typename T::Communic
         return Progress::Thread;
 }
 
-} // namespace detail
-
-template <class T>
-inline constexpr bool is_transport_v = detail::has_communicator_v<T>&& detail::has_rank_and_size_v<T>&&
-    detail::has_send_v<T>&& detail::has_poll_v<T>&& detail::has_nap_v<T>&& detail::has_start_and_stop_v<T>;
-
-namespace detail {
-
 template <class T>
 constexpr bool checkTransport()
 {
@@ -181,10 +173,14 @@ constexpr bool checkTransport()
         static_assert(has_start_and_stop_v<T>,
                       "dfb: Transport must provide void start(TransportHandler&) and void stop(bool orderly)");
     }
-    return is_transport_v<T>;
+    return true;
 }
 
 } // namespace detail
+
+template <class T>
+inline constexpr bool is_transport_v = detail::has_communicator_v<T>&& detail::has_rank_and_size_v<T>&&
+    detail::has_send_v<T>&& detail::has_poll_v<T>&& detail::has_nap_v<T>&& detail::has_start_and_stop_v<T>;
 
 inline constexpr std::int64_t bytesOfPlace = 64;
 

@@ -135,9 +135,8 @@ private:
 // the world.
 class ThinLensCamera {
 public:
-    // Looks along `view`, of any length. The distance may be infinite. Throws InvalidArgument if `view` is 0, `up` is 0
-    // or along it, `fovY` is not in (0, 180), the radius is below 0, the distance is not above 0, or another number is
-    // not finite.
+    // As PerspectiveCamera::along(). The distance may be infinite. Also throws InvalidArgument if the radius is below 0
+    // or the distance is not above 0.
     ThinLensCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float apertureRadius,
                    float focusDistance)
         : pose_(detail::poseOf(eye, view, up, fovY)), radius_(static_cast<double>(apertureRadius)),
@@ -169,9 +168,8 @@ private:
 // sees. The eyes are `separation` apart. A point at `convergence` along the view is at the same place in both halves.
 class StereoCamera {
 public:
-    // Looks along `view`, of any length; `fovY` is that of each half. `convergence` may be infinite: the eyes then look
-    // in parallel. Throws InvalidArgument if `view` is 0, `up` is 0 or along it, `fovY` is not in (0, 180),
-    // `separation` is below 0, `convergence` is not above 0, or another number is not finite.
+    // As PerspectiveCamera::along(); `fovY` is that of each half. `convergence` may be infinite: the eyes then look in
+    // parallel. Also throws InvalidArgument if `separation` is below 0 or `convergence` is not above 0.
     StereoCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float separation, float convergence)
         : pose_(detail::poseOf(eye, view, up, fovY)), separation_(static_cast<double>(separation)),
           convergence_(static_cast<double>(convergence))
@@ -275,9 +273,8 @@ private:
 // Motion blur of a camera that turns around an axis while the shutter is open: by `degrees` from sample time 0 to 1.
 class OrbitBlurCamera {
 public:
-    // At time 0 it looks from `eye` along `view`; the axis goes through `center`. Throws InvalidArgument if `view` is
-    // 0, `up` is 0 or along it, `fovY` is not in (0, 180), the axis has length 0, `degrees` is not within +-360, or a
-    // number is not finite.
+    // At time 0 it is as PerspectiveCamera::along(); the axis goes through `center`. Also throws InvalidArgument if the
+    // axis has length 0 or `degrees` is not within +-360.
     OrbitBlurCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, const Vec3& center, const Vec3& axis,
                     float degrees)
         : pose_(detail::poseOf(eye, view, up, fovY)), center_(toDouble(center)), axis_(toDouble(axis)),

@@ -3,7 +3,6 @@
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
-#include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/framebuffer_base.hpp>
 #include <dfb/render/link_owners.hpp>
@@ -68,31 +67,36 @@ struct Job {
 class PassJobs {
 public:
     // `passesOf(item)`: how many passes an item has.
-    void find(std::size_t itemCount, FunctionRef<int(std::size_t)> passesOf);
+    void find(std::size_t itemCount, FunctionRef<int(std::size_t)> passesOf)
+    {
+        firstJob_.assign(1, 0);
+        for (std::size_t i = 0; i < itemCount; ++i)
+            firstJob_.push_back(firstJob_.back() + passesOf(i));
+    }
 
     std::int64_t count() const noexcept { return firstJob_.back(); }
 
-    Job at(std::int64_t job) const;
+    Job at(std::int64_t job) const
+    {
+        const auto next = std::upper_bound(firstJob_.begin(), firstJob_.end(), job);
+        const auto item = static_cast<std::size_t>(next - firstJob_.begin()) - 1;
+        return {item, static_cast<int>(job - firstJob_[item])};
+    }
 
 private:
     std::vector<std::int64_t> firstJob_{0}; // the first job of each item; at the end, the number of jobs
 };
 
-#if DFB_HAS_BODIES
-DFB_COMPILED_ONCE void PassJobs::find(std::size_t itemCount, FunctionRef<int(std::size_t)> passesOf)
+// Returns a stride whose multiples, modulo `count`, are all numbers below `count`. Consecutive multiples are spread
+// evenly over the image. Neighbours in an image cost alike, so a rank that gets some consecutive ones gets a fair
+// share.
+inline std::int64_t scatteringStride(std::int64_t count)
 {
-    firstJob_.assign(1, 0);
-    for (std::size_t i = 0; i < itemCount; ++i)
-        firstJob_.push_back(firstJob_.back() + passesOf(i));
+    auto stride = static_cast<std::int64_t>(0.6180339887498949 * static_cast<double>(count)); // the golden section
+    while (stride > 1 && std::gcd(stride, count) != 1)
+        --stride;
+    return std::max<std::int64_t>(stride, 1);
 }
-
-DFB_COMPILED_ONCE Job PassJobs::at(std::int64_t job) const
-{
-    const auto next = std::upper_bound(firstJob_.begin(), firstJob_.end(), job);
-    const auto item = static_cast<std::size_t>(next - firstJob_.begin()) - 1;
-    return {item, static_cast<int>(job - firstJob_[item])};
-}
-#endif
 
 } // namespace detail
 
@@ -107,17 +111,6 @@ enum class WorkDistribution : std::uint8_t {
 
 namespace detail {
 
-// Returns a stride whose multiples, modulo `count`, are all numbers below `count`. Consecutive multiples are spread
-// evenly over the image. Neighbours in an image cost alike, so a rank that gets some consecutive ones gets a fair
-// share.
-inline std::int64_t scatteringStride(std::int64_t count)
-{
-    auto stride = static_cast<std::int64_t>(0.6180339887498949 * static_cast<double>(count)); // the golden section
-    while (stride > 1 && std::gcd(stride, count) != 1)
-        --stride;
-    return std::max<std::int64_t>(stride, 1);
-}
-
 // The jobs of a rank in an image-parallel frame: pairs of tile and pass.
 class ImageShare {
 public:
@@ -128,7 +121,27 @@ public:
 
     // Calls render(part) until this rank has nothing more to render in this frame.
     void forEachPart(FrameBase& frame, const FrameBufferBase& fb, WorkDistribution distribution,
-                     FunctionRef<void(const Part&)> render);
+                     FunctionRef<void(const Part&)> render)
+    {
+        tiles_ = distribution == WorkDistribution::Owned ? &frame.ownedTiles() : nullptr;
+        jobs_.find(tiles_ ? tiles_->size() : static_cast<std::size_t>(fb.layout().tileCount()),
+                   [&](std::size_t item) { return frame.samples(tileOf(item)).count; });
+        const std::int64_t count = jobs_.count(), rank = fb.rank(), size = fb.size();
+        switch (distribution) {
+        case WorkDistribution::Owned: render({0, count}); break;
+        case WorkDistribution::Linear:
+            render({count * rank / size, count * (rank + 1) / size - count * rank / size});
+            break;
+        case WorkDistribution::RoundRobin: render({rank, (count - rank + size - 1) / size, size}); break;
+        case WorkDistribution::Dynamic: {
+            const std::int64_t stride = scatteringStride(count);
+            for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
+                 range = frame.nextJobs(count))
+                render({range.begin * stride, range.end - range.begin, stride});
+            break;
+        }
+        }
+    }
 
     // The tile of the i-th job of a part, and its pass.
     std::pair<int, int> at(const Part& part, std::int64_t i) const
@@ -143,31 +156,6 @@ private:
     const std::vector<int>* tiles_ = nullptr; // null: all tiles of the image
     PassJobs jobs_;
 };
-
-#if DFB_HAS_BODIES
-DFB_COMPILED_ONCE void ImageShare::forEachPart(FrameBase& frame, const FrameBufferBase& fb,
-                                               WorkDistribution distribution, FunctionRef<void(const Part&)> render)
-{
-    tiles_ = distribution == WorkDistribution::Owned ? &frame.ownedTiles() : nullptr;
-    jobs_.find(tiles_ ? tiles_->size() : static_cast<std::size_t>(fb.layout().tileCount()),
-               [&](std::size_t item) { return frame.samples(tileOf(item)).count; });
-    const std::int64_t count = jobs_.count(), rank = fb.rank(), size = fb.size();
-    switch (distribution) {
-    case WorkDistribution::Owned: render({0, count}); break;
-    case WorkDistribution::Linear:
-        render({count * rank / size, count * (rank + 1) / size - count * rank / size});
-        break;
-    case WorkDistribution::RoundRobin: render({rank, (count - rank + size - 1) / size, size}); break;
-    case WorkDistribution::Dynamic: {
-        const std::int64_t stride = scatteringStride(count);
-        for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
-             range = frame.nextJobs(count))
-            render({range.begin * stride, range.end - range.begin, stride});
-        break;
-    }
-    }
-}
-#endif
 
 } // namespace detail
 
@@ -254,52 +242,45 @@ public:
 private:
     // Sets config.order if it is not set, all rays begin at `eye`, and the bricks have an order. The time grows with
     // the square of the number of bricks, so it does nothing for more than 1024.
-    void findOrder(FrameConfig& config, const SharedWorld& world, const std::optional<Vec3>& eye);
+    void findOrder(FrameConfig& config, const SharedWorld& world, const std::optional<Vec3>& eye)
+    {
+        const std::vector<SharedBrick>& bricks = world.bricks();
+        if (config.order || !eye || bricks.size() > 1024 || frontToBack_.find(world, *eye))
+            return;
+        sources_.clear();
+        for (const int brick : frontToBack_.order())
+            sources_.push_back(bricks[static_cast<std::size_t>(brick)].id);
+        if (!order_ || sources_ != orderSources_) {
+            order_ = std::make_shared<const SourceOrder>(sources_);
+            orderSources_.swap(sources_);
+        }
+        config.order = order_;
+    }
 
     // Sets config.owners, where ranks are on several nodes, unless it is set or the framebuffer has an owner map.
     // `hasDepth`: whether inputs have depth. `tilesOf(bounds, found)`: the tiles that a box may project to.
     void findOwners(FrameConfig& config, const FrameBufferBase& fb, const SharedWorld& world, bool hasDepth,
-                    FunctionRef<void(const Box3&, FoundTile)> tilesOf);
+                    FunctionRef<void(const Box3&, FoundTile)> tilesOf)
+    {
+        if (config.owners || fb.config().image.ownerMap)
+            return;
+        if (!owners_)
+            owners_.emplace(fb.nodeOf());
+        if (owners_->isOneNode())
+            return;
+        owners_->start(fb.layout());
+        for (const SharedBrick& b : world.bricks())
+            tilesOf(b.bounds, [&](int tile, const Region& pixels) {
+                owners_->add(tile, pixels, b.ranks.data(), b.ranks.size());
+            });
+        config.owners = owners_->find(fb.config(), hasDepth, [&](int tile) { return fb.tileOwner(tile); });
+    }
 
     FrontToBack frontToBack_;
     std::vector<std::uint32_t> sources_, orderSources_; // orderSources_: of order_
     std::shared_ptr<const SourceOrder> order_;
     std::optional<LinkOwners> owners_;
 };
-
-#if DFB_HAS_BODIES
-DFB_COMPILED_ONCE void FromWorld::findOrder(FrameConfig& config, const SharedWorld& world,
-                                            const std::optional<Vec3>& eye)
-{
-    const std::vector<SharedBrick>& bricks = world.bricks();
-    if (config.order || !eye || bricks.size() > 1024 || frontToBack_.find(world, *eye))
-        return;
-    sources_.clear();
-    for (const int brick : frontToBack_.order())
-        sources_.push_back(bricks[static_cast<std::size_t>(brick)].id);
-    if (!order_ || sources_ != orderSources_) {
-        order_ = std::make_shared<const SourceOrder>(sources_);
-        orderSources_.swap(sources_);
-    }
-    config.order = order_;
-}
-
-DFB_COMPILED_ONCE void FromWorld::findOwners(FrameConfig& config, const FrameBufferBase& fb, const SharedWorld& world,
-                                             bool hasDepth, FunctionRef<void(const Box3&, FoundTile)> tilesOf)
-{
-    if (config.owners || fb.config().image.ownerMap)
-        return;
-    if (!owners_)
-        owners_.emplace(fb.nodeOf());
-    if (owners_->isOneNode())
-        return;
-    owners_->start(fb.layout());
-    for (const SharedBrick& b : world.bricks())
-        tilesOf(b.bounds,
-                [&](int tile, const Region& pixels) { owners_->add(tile, pixels, b.ranks.data(), b.ranks.size()); });
-    config.owners = owners_->find(fb.config(), hasDepth, [&](int tile) { return fb.tileOwner(tile); });
-}
-#endif
 
 // The jobs of a rank that renders its own bricks, and its declaration.
 class OwnBricks {

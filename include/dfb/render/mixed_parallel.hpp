@@ -14,7 +14,6 @@
 
 #include <dfb/base/detect.hpp>
 #include <dfb/base/function_ref.hpp>
-#include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/framebuffer_base.hpp>
 #include <dfb/render/loops.hpp>
@@ -187,39 +186,34 @@ struct MixedWork {
     }
 
 private:
-    void countPasses(FrameBase& frame);
-    void pickJobs(const SharedWorld& world, OwnerRef owner, int own);
-};
-
-#if DFB_HAS_BODIES
-DFB_COMPILED_ONCE void MixedWork::countPasses(FrameBase& frame)
-{
-    passes.clear();
-    int inTile = 0, most = 1;
-    for (std::size_t p = 0; p < pairs.size(); ++p) {
-        passes.push_back(frame.samples(pairs[p].tile).count);
-        inTile = p > 0 && pairs[p].tile == pairs[p - 1].tile ? inTile + 1 : 1;
-        most = std::max(most, inTile);
+    void countPasses(FrameBase& frame)
+    {
+        passes.clear();
+        int inTile = 0, most = 1;
+        for (std::size_t p = 0; p < pairs.size(); ++p) {
+            passes.push_back(frame.samples(pairs[p].tile).count);
+            inTile = p > 0 && pairs[p].tile == pairs[p - 1].tile ? inTile + 1 : 1;
+            most = std::max(most, inTile);
+        }
+        frame.expectLayers(most);
     }
-    frame.expectLayers(most);
-}
 
-DFB_COMPILED_ONCE void MixedWork::pickJobs(const SharedWorld& world, OwnerRef owner, int own)
-{
-    jobs.clear();
-    for (std::size_t p = 0; p < pairs.size(); ++p) {
-        const SharedBrick& brick = brickOf(world, pairs[p]);
-        for (int pass = 0; pass < passes[p]; ++pass) {
-            const int rank = owner(brick, pairs[p].tile, pass);
-            if (!std::binary_search(brick.ranks.begin(), brick.ranks.end(), rank))
-                failArgument("the tile-brick owner gives tile %d of brick %u to rank %d, which does not hold it",
-                             pairs[p].tile, brick.id, rank);
-            if (rank == own)
-                jobs.push_back({p, pass});
+    void pickJobs(const SharedWorld& world, OwnerRef owner, int own)
+    {
+        jobs.clear();
+        for (std::size_t p = 0; p < pairs.size(); ++p) {
+            const SharedBrick& brick = brickOf(world, pairs[p]);
+            for (int pass = 0; pass < passes[p]; ++pass) {
+                const int rank = owner(brick, pairs[p].tile, pass);
+                if (!std::binary_search(brick.ranks.begin(), brick.ranks.end(), rank))
+                    failArgument("the tile-brick owner gives tile %d of brick %u to rank %d, which does not hold it",
+                                 pairs[p].tile, brick.id, rank);
+                if (rank == own)
+                    jobs.push_back({p, pass});
+            }
         }
     }
-}
-#endif
+};
 
 // The work of an OrderedLoop: that of a MixedParallelLoop in a known order.
 struct OrderedWork : MixedWork {
@@ -234,10 +228,32 @@ struct OrderedWork : MixedWork {
     std::vector<Job> undecided; // jobs that another rank may hide
 
     // Sorts `pairs` by tile, then front to back. Throws InvalidArgument if `order` does not have each brick once.
-    void sortFrontToBack(const SharedWorld& world, const std::vector<int>& order);
+    void sortFrontToBack(const SharedWorld& world, const std::vector<int>& order)
+    {
+        place.assign(world.bricks().size(), -1);
+        for (std::size_t i = 0; i < order.size(); ++i)
+            if (const auto brick = static_cast<std::size_t>(order[i]); brick < place.size())
+                place[brick] = static_cast<int>(i);
+        if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
+            failArgument("the order does not have each brick once");
+        std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
+            return a.tile != b.tile
+                       ? a.tile < b.tile
+                       : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
+        });
+    }
 
     // Finds which of this rank's tiles no brick projects to, and where the pairs of the other tiles begin.
-    void findEmpty(int tileCount, const std::vector<int>& ownedTiles);
+    void findEmpty(int tileCount, const std::vector<int>& ownedTiles)
+    {
+        firstPair.assign(static_cast<std::size_t>(tileCount), -1);
+        for (std::size_t p = pairs.size(); p-- > 0;)
+            firstPair[static_cast<std::size_t>(pairs[p].tile)] = static_cast<int>(p);
+        empty.clear();
+        for (const int tile : ownedTiles)
+            if (firstPair[static_cast<std::size_t>(tile)] < 0)
+                empty.push_back(tile);
+    }
 
     int generationOf(const Job& job) const
     {
@@ -246,129 +262,91 @@ struct OrderedWork : MixedWork {
 
     // Puts the jobs first that are in front in their tile, so that other ranks hear soon which inputs are hidden. Not
     // for images in which nothing is hidden: their tiles would be complete later.
-    void renderFrontsFirst();
+    void renderFrontsFirst()
+    {
+        std::stable_partition(jobs.begin(), jobs.end(), [this](const Job& job) { return generationOf(job) == 0; });
+    }
 
     // Announces this rank's inputs that hid others in the last frame, which are likely to do so again, to the ranks
     // behind them.
-    void announceHiders(const FrameBase& frame, const SharedWorld& world, int tileCount, OwnerRef owner);
+    void announceHiders(const FrameBase& frame, const SharedWorld& world, int tileCount, OwnerRef owner)
+    {
+        if (hider.size() != static_cast<std::size_t>(tileCount)) {
+            hider = std::vector<std::atomic<int>>(static_cast<std::size_t>(tileCount));
+            std::fill(hider.begin(), hider.end(), -1);
+        }
+        announced.assign(hider.size(), -1);
+        for (const Job& job : jobs) {
+            const BrickInTile& pair = pairs[job.item];
+            const auto tile = static_cast<std::size_t>(pair.tile);
+            if (hider[tile] != pair.brick || !frame.opaqueHides(pair.tile))
+                continue;
+            announced[tile] = pair.brick;
+            forEachRankBehind(world, job, owner,
+                              [&](int generation, int rank) { frame.mayHide(pair.tile, generation, rank); });
+        }
+    }
 
     // Tells the ranks behind an input that it hides theirs; or, if they wait to be told, that it does not.
-    void tellBehind(const FrameBase& frame, const SharedWorld& world, const Job& job, OwnerRef owner, bool hides);
+    void tellBehind(const FrameBase& frame, const SharedWorld& world, const Job& job, OwnerRef owner, bool hides)
+    {
+        const BrickInTile& pair = pairs[job.item];
+        const auto tile = static_cast<std::size_t>(pair.tile);
+        if (!hides && announced[tile] != pair.brick)
+            return; // nobody waits
+        if (hides)
+            anyHidden = true;
+        hider[tile] = hides ? pair.brick : -1;
+        forEachRankBehind(world, job, owner, [&](int generation, int rank) {
+            if (hides)
+                frame.hide(pair.tile, generation, rank);
+            else
+                frame.show(pair.tile, generation, rank);
+        });
+    }
 
     // Waits until other ranks have said of some undecided jobs whether they hide them, and moves these to `jobs`.
     // Returns false if there are no more, or the frame has failed.
-    bool takeDecided(const FrameBase& frame);
+    bool takeDecided(const FrameBase& frame)
+    {
+        const auto isUndecided = [&](const Job& job) {
+            return frame.isUndecided(pairs[job.item].tile, generationOf(job));
+        };
+        while (!undecided.empty() && !frame.failed()) {
+            auto decided = std::stable_partition(undecided.begin(), undecided.end(), isUndecided);
+            const auto heard = [&] { return !std::all_of(undecided.begin(), undecided.end(), isUndecided); };
+            if (decided == undecided.end()) {
+                if (frame.waitForWord(heard))
+                    continue;
+                decided = undecided.begin(); // there was no word in time
+            }
+            jobs.assign(decided, undecided.end());
+            undecided.erase(decided, undecided.end());
+            return true;
+        }
+        return false;
+    }
 
 private:
     // Calls f(generation, rank) for each rank that renders something behind a job. `generation` is the first one behind
     // it.
     void forEachRankBehind(const SharedWorld& world, const Job& job, OwnerRef owner,
-                           FunctionRef<void(int, int)> f) const;
-};
-
-#if DFB_HAS_BODIES
-DFB_COMPILED_ONCE void OrderedWork::sortFrontToBack(const SharedWorld& world, const std::vector<int>& order)
-{
-    place.assign(world.bricks().size(), -1);
-    for (std::size_t i = 0; i < order.size(); ++i)
-        if (const auto brick = static_cast<std::size_t>(order[i]); brick < place.size())
-            place[brick] = static_cast<int>(i);
-    if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
-        failArgument("the order does not have each brick once");
-    std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
-        return a.tile != b.tile ? a.tile < b.tile
-                                : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
-    });
-}
-
-DFB_COMPILED_ONCE void OrderedWork::findEmpty(int tileCount, const std::vector<int>& ownedTiles)
-{
-    firstPair.assign(static_cast<std::size_t>(tileCount), -1);
-    for (std::size_t p = pairs.size(); p-- > 0;)
-        firstPair[static_cast<std::size_t>(pairs[p].tile)] = static_cast<int>(p);
-    empty.clear();
-    for (const int tile : ownedTiles)
-        if (firstPair[static_cast<std::size_t>(tile)] < 0)
-            empty.push_back(tile);
-}
-
-DFB_COMPILED_ONCE void OrderedWork::renderFrontsFirst()
-{
-    std::stable_partition(jobs.begin(), jobs.end(), [this](const Job& job) { return generationOf(job) == 0; });
-}
-
-DFB_COMPILED_ONCE void OrderedWork::announceHiders(const FrameBase& frame, const SharedWorld& world, int tileCount,
-                                                   OwnerRef owner)
-{
-    if (hider.size() != static_cast<std::size_t>(tileCount)) {
-        hider = std::vector<std::atomic<int>>(static_cast<std::size_t>(tileCount));
-        std::fill(hider.begin(), hider.end(), -1);
-    }
-    announced.assign(hider.size(), -1);
-    for (const Job& job : jobs) {
-        const BrickInTile& pair = pairs[job.item];
-        const auto tile = static_cast<std::size_t>(pair.tile);
-        if (hider[tile] != pair.brick || !frame.opaqueHides(pair.tile))
-            continue;
-        announced[tile] = pair.brick;
-        forEachRankBehind(world, job, owner,
-                          [&](int generation, int rank) { frame.mayHide(pair.tile, generation, rank); });
-    }
-}
-
-DFB_COMPILED_ONCE void OrderedWork::tellBehind(const FrameBase& frame, const SharedWorld& world, const Job& job,
-                                               OwnerRef owner, bool hides)
-{
-    const BrickInTile& pair = pairs[job.item];
-    const auto tile = static_cast<std::size_t>(pair.tile);
-    if (!hides && announced[tile] != pair.brick)
-        return; // nobody waits
-    if (hides)
-        anyHidden = true;
-    hider[tile] = hides ? pair.brick : -1;
-    forEachRankBehind(world, job, owner, [&](int generation, int rank) {
-        if (hides)
-            frame.hide(pair.tile, generation, rank);
-        else
-            frame.show(pair.tile, generation, rank);
-    });
-}
-
-DFB_COMPILED_ONCE bool OrderedWork::takeDecided(const FrameBase& frame)
-{
-    const auto isUndecided = [&](const Job& job) { return frame.isUndecided(pairs[job.item].tile, generationOf(job)); };
-    while (!undecided.empty() && !frame.failed()) {
-        auto decided = std::stable_partition(undecided.begin(), undecided.end(), isUndecided);
-        const auto heard = [&] { return !std::all_of(undecided.begin(), undecided.end(), isUndecided); };
-        if (decided == undecided.end()) {
-            if (frame.waitForWord(heard))
+                           FunctionRef<void(int, int)> f) const
+    {
+        const int tile = pairs[job.item].tile;
+        static thread_local std::vector<int> spare; // not used itself, as owner() may do other work meanwhile
+        std::vector<int> told = std::move(spare);
+        told.clear();
+        for (std::size_t p = job.item + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
+            const int rank = owner(brickOf(world, pairs[p]), tile, 0);
+            if (std::find(told.begin(), told.end(), rank) != told.end())
                 continue;
-            decided = undecided.begin(); // there was no word in time
+            f(generationOf(job) + 1, rank);
+            told.push_back(rank);
         }
-        jobs.assign(decided, undecided.end());
-        undecided.erase(decided, undecided.end());
-        return true;
+        spare = std::move(told);
     }
-    return false;
-}
-
-DFB_COMPILED_ONCE void OrderedWork::forEachRankBehind(const SharedWorld& world, const Job& job, OwnerRef owner,
-                                                      FunctionRef<void(int, int)> f) const
-{
-    const int tile = pairs[job.item].tile;
-    static thread_local std::vector<int> spare; // not used itself, as owner() may do other work meanwhile
-    std::vector<int> told = std::move(spare);
-    told.clear();
-    for (std::size_t p = job.item + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
-        const int rank = owner(brickOf(world, pairs[p]), tile, 0);
-        if (std::find(told.begin(), told.end(), rank) != told.end())
-            continue;
-        f(generationOf(job) + 1, rank);
-        told.push_back(rank);
-    }
-    spare = std::move(told);
-}
-#endif
+};
 
 // Calls renderBrick, and takes note of the cost for an owner that plans.
 template <class Owner, class RenderBrick, class Tile>
