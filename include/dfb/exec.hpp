@@ -8,6 +8,7 @@
 #include <dfb/version.hpp>
 
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <cstddef>
 #include <exception>
@@ -69,7 +70,10 @@ public:
     // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Any thread may call it,
     // several at once. Waits until all these calls have returned. On a worker of a ThreadExecutor, that thread alone
     // runs the loop. Rethrows the first exception of a body; after it no other body begins.
-    void parallelFor(std::size_t count, detail::FunctionRef<void(std::size_t)> body)
+    // `meanwhile`: called on the calling thread every millisecond while that waits, if it takes no part in the loop.
+    // Must not throw.
+    void parallelFor(std::size_t count, detail::FunctionRef<void(std::size_t)> body,
+                     const std::function<void()>& meanwhile = nullptr)
     {
         if (count == 0)
             return;
@@ -88,7 +92,7 @@ public:
             while (depth() == 0 && help()) {
             }
         };
-        run(count, std::ref(guarded)); // std::ref, unlike a copy, takes no memory
+        runBeside(count, std::ref(guarded), meanwhile); // std::ref, unlike a copy, takes no memory
         if (error)
             std::rethrow_exception(error);
     }
@@ -98,6 +102,12 @@ protected:
     virtual void wake() = 0;
     // Calls body(i) for all i on the workers, and waits. The body does not throw.
     virtual void run(std::size_t count, const std::function<void(std::size_t)>& body) = 0;
+    // Does so, and calls `meanwhile`, unless it is null, as parallelFor() says.
+    virtual void runBeside(std::size_t count, const std::function<void(std::size_t)>& body,
+                           const std::function<void()>& /*meanwhile*/)
+    {
+        run(count, body);
+    }
 
 private:
     // How many tasks, one within the other, the calling thread is running.
@@ -182,6 +192,12 @@ private:
 
     void run(std::size_t count, const std::function<void(std::size_t)>& body) override
     {
+        runBeside(count, body, nullptr);
+    }
+
+    void runBeside(std::size_t count, const std::function<void(std::size_t)>& body,
+                   const std::function<void()>& meanwhile) override
+    {
         if (current() == this || resting_ > 0) {
             for (std::size_t i = 0; i < count; ++i)
                 body(i);
@@ -191,7 +207,13 @@ private:
         std::unique_lock<std::mutex> lock(mutex_);
         loops_.push(&loop);
         wakeUp_.notify_all();
-        loopDone_.wait(lock, [&] { return loop.done == loop.count; });
+        const auto isDone = [&] { return loop.done == loop.count; };
+        while (meanwhile && !loopDone_.wait_for(lock, std::chrono::milliseconds(1), isDone)) {
+            lock.unlock();
+            meanwhile();
+            lock.lock();
+        }
+        loopDone_.wait(lock, isDone);
     }
 
     void work()

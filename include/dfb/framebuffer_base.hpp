@@ -226,7 +226,7 @@ public:
 
     // Copies the display rank's image() to every rank, and returns it; an empty image if image() is empty there. The
     // bytes travel along a tree of the ranks. Takes memory for several more images on every rank while it runs.
-    // Collective, outside frames. Waits and throws as allGather().
+    // Collective. Call it while no frame is open; this is not checked. Waits and throws as allGather().
     Image imageOnAllRanks() { return lastEnded_->imageOnAllRanks(engine()); }
 
     // The number of the frame that image() shows, as in FrameReport::frame; -1 if it is empty. Thread as above.
@@ -237,9 +237,9 @@ public:
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
     // For programs without a progress thread (Progress::Caller) or without workers (CallerExecutor); otherwise it does
-    // nothing. Moves messages, if this thread may call MPI, and runs waiting tasks. Returns whether there was anything
-    // to do. Call it now and then during long work without setTile(), so that compositing goes on and other ranks need
-    // not wait. Any thread. Waits for no other rank.
+    // nothing. Moves messages, if this thread may call MPI (see Progress), and runs waiting tasks. Returns whether
+    // there was anything to do. Call it now and then during long work without setTile(), so that compositing goes on
+    // and other ranks need not wait. Not needed in the jobs of a loop. Any thread. Waits for no other rank.
     bool poll() { return engine().poll(); }
 
     // Changes the size of the image, in pixels. Afterwards image() is empty, tile operations are made anew and have
@@ -258,10 +258,10 @@ public:
     using Reduce = dfb::Reduce;
 
     // Combines `values` element by element over all ranks, and returns the result on all. A sum that is too large wraps
-    // around. For figures of your own, or to find out on all ranks whether each could load its data. Collective,
-    // outside frames. Waits for all ranks, without a time-out: if one does not call it, the others wait until that rank
-    // destroys its framebuffer or is lost. Throws InvalidArgument on every rank if the numbers of values differ or a
-    // rank makes another collective call. Throws TransportError.
+    // around. For figures of your own, or to find out on all ranks whether each could load its data. Collective.
+    // Call it while no frame is open; this is not checked. Waits for all ranks, without a time-out: if one does not
+    // call it, the others wait until that rank destroys its framebuffer or is lost. Throws InvalidArgument on every
+    // rank if the numbers of values differ or a rank makes another collective call. Throws TransportError.
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how)
     {
         return engine().allReduce(values, how);
@@ -269,7 +269,7 @@ public:
 
     // Returns the bytes of each rank, by rank, on all ranks. `call` is the name of this call in the error that is
     // thrown if ranks make different calls. The sizes may differ and may be 0; each rank needs memory for the bytes of
-    // all, several times. Collective, outside frames. Waits and throws as allReduce(); also throws std::bad_alloc on a
+    // all, several times. Collective, call it as allReduce(). Waits and throws as that; also throws std::bad_alloc on a
     // rank that lacks memory.
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call = "allGather()")
     {
@@ -326,7 +326,7 @@ DFB_COMPILED_ONCE void FrameBase::forEachJob(std::int64_t count, TileHeader* (*t
 {
     guard([&] {
         const auto jobs = static_cast<std::size_t>(std::max<std::int64_t>(count, 0));
-        fb_->executor().parallelFor(jobs, [&](std::size_t i) {
+        engine_->parallelFor(jobs, [&](std::size_t i) {
             if (failed())
                 return;
             TileHeader* const tile = take();

@@ -34,12 +34,12 @@ DFB_NAMESPACE_BEGIN
 
 // How the images of the ranks become one.
 enum class ImageBlend : std::uint8_t {
-    Nearest, // the nearest input of each pixel wins: for opaque geometry; a pixel without a depth is empty
+    Nearest, // the nearest input of each pixel wins: for opaque geometry; a pixel at depth +infinity or NaN is empty
     ByDepth, // each pixel blended front to back by depth; at equal depths the lower rank is in front
     InOrder  // images blended front to back in an order of the ranks; no depth is needed
 };
 
-// The image that a rank has rendered, in memory of the program. ImageCompositor::start() reads it.
+// The image that a rank has rendered, in the program's host memory (not a GPU's). ImageCompositor::start() reads it.
 struct InputImage {
     // This rank has nothing to show.
     InputImage() = default;
@@ -544,7 +544,7 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place)
         static thread_local detail::InputTile::Converted converted; // keeps its memory from tile to tile
         engine_->setTile(part.find(view, converted));
     };
-    config().executor->parallelFor(inputs_.size(), sendTile);
+    engine_->parallelFor(inputs_.size(), sendTile);
 }
 
 DFB_NAMESPACE_END

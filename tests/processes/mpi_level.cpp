@@ -9,6 +9,7 @@
 #include <mpi.h>
 
 #include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
@@ -37,6 +38,8 @@ bool has(const std::string& text, const char* part) { return text.find(part) != 
 
 std::thread::id mainThread;
 std::atomic<int> callsElsewhere{0}; // of MPI, by other threads than that
+
+std::atomic<int> sends{0};
 
 void noteCall() { callsElsewhere += std::this_thread::get_id() != mainThread; }
 
@@ -208,6 +211,32 @@ void smallPool()
     }
 }
 
+// Messages leave while workers render, even if these may not call MPI, whatever the renderer does.
+void whileWorkersRender()
+{
+    auto config = smallConfig();
+    config.image.ownerMap = [](int tile, const dfb::TileLayout&, int ranks) { return (tile + 1) % ranks; };
+    FrameBuffer fb(MPI_COMM_WORLD, config);
+    std::vector<int> mine; // owned by others
+    for (int tile = fb.rank(); tile < fb.layout().tileCount(); tile += fb.size())
+        mine.push_back(tile);
+    auto frame = fb.begin();
+    std::atomic<int> kept{0};
+    frame.forEachTile(mine, [&](auto& tile) {
+        const int before = sends;
+        tile.fill({0, greenOf(1) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
+        frame.setTile(tile);
+        const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(5);
+        while (sends == before && std::chrono::steady_clock::now() < limit)
+            std::this_thread::yield();
+        kept += sends == before;
+    });
+    frame.end();
+    check(kept == 0, "inputs that were kept while workers rendered", std::to_string(kept));
+    if (fb.isDisplayRank())
+        checkImage(fb.image(), fb.layout(), 1, "while workers rendered");
+}
+
 } // namespace
 
 // In place of MPI's own: all that the library does once it is there.
@@ -216,6 +245,7 @@ extern "C" {
 int MPI_Isend(const void* data, int count, MPI_Datatype type, int to, int tag, MPI_Comm comm, MPI_Request* request)
 {
     noteCall();
+    ++sends;
     return PMPI_Isend(data, count, type, to, tag, comm, request);
 }
 
@@ -284,6 +314,7 @@ int main(int argc, char** argv)
         frames(smallConfig(), expected, "two workers");
         wallAndSharedWorld();
         smallPool();
+        whileWorkersRender();
         if (!isMixed && level < MPI_THREAD_SERIALIZED)
             otherThread();
     } catch (const std::exception& e) {

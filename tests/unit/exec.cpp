@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <memory>
 #include <mutex>
@@ -211,6 +212,32 @@ TEST_CASE("While the workers of a ThreadExecutor rest, the threads that call do 
     std::unique_lock<std::mutex> lock(mutex);
     CHECK(changed.wait_for(lock, std::chrono::seconds(10), [&] { return threads.size() == 5; }));
     CHECK((threads[3] != std::this_thread::get_id() && threads[4] != std::this_thread::get_id()));
+}
+
+TEST_CASE("A thread that waits for a loop does something else meanwhile", "[executor]")
+{
+    const auto self = std::this_thread::get_id();
+    std::atomic<int> calls{0}, elsewhere{0};
+    const auto meanwhile = [&] {
+        ++calls;
+        elsewhere += std::this_thread::get_id() != self;
+    };
+    dfb::ThreadExecutor threads(2);
+    const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(10);
+    threads.parallelFor(
+        3,
+        [&](std::size_t) {
+            for (const int before = calls; calls == before && std::chrono::steady_clock::now() < limit;)
+                std::this_thread::yield();
+        },
+        meanwhile);
+    CHECK(calls >= 2); // two of the loop's three calls may have waited for the same one
+    CHECK(elsewhere == 0);
+
+    calls = 0;
+    dfb::CallerExecutor caller;
+    caller.parallelFor(3, [](std::size_t) {}, meanwhile); // takes part
+    CHECK(calls == 0);
 }
 
 TEST_CASE("Waiting tasks run between the iterations of a loop", "[executor]")

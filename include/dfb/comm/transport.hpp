@@ -79,8 +79,9 @@ enum class Progress {
     // A thread of the library's own. With MPI it needs MPI_THREAD_MULTIPLE.
     Thread,
     // The program's own threads: messages move in DistributedFrameBuffer::poll(), in Frame::setTile(), and in calls
-    // that wait, such as the constructor and Frame::end(). At MPI_THREAD_SINGLE and MPI_THREAD_FUNNELED only the thread
-    // that initialised MPI may make calls that wait; at MPI_THREAD_SERIALIZED no other thread may call MPI meanwhile.
+    // that wait, such as the constructor, Frame::forEachTile() and Frame::end(). At MPI_THREAD_SINGLE and
+    // MPI_THREAD_FUNNELED only the thread that initialised MPI may make calls that wait for other ranks, and on other
+    // threads poll() and setTile() move nothing. At MPI_THREAD_SERIALIZED no other thread may call MPI meanwhile.
     Caller
 };
 

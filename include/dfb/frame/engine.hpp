@@ -41,6 +41,8 @@ public:
     virtual Image imageOnAllRanks(Engine& gatherer) = 0; // by an allGather() of that engine
     virtual bool isComplete(int tile) const = 0;
     virtual bool poll() = 0;
+    // By the executor. If nobody else moves messages, the calling thread does, while workers run the loop.
+    virtual void parallelFor(std::size_t count, FunctionRef<void(std::size_t)> body) = 0;
     virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) = 0;
     virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call) = 0;
 

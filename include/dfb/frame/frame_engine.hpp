@@ -22,6 +22,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <exception>
+#include <functional>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -248,6 +249,20 @@ public:
         }
         polled();
         return did;
+    }
+
+    void parallelFor(std::size_t count, FunctionRef<void(std::size_t)> body) override
+    {
+        std::function<void()> meanwhile;
+        if (mailbox_->connection().needsCaller() && mailbox_->connection().mayPoll())
+            meanwhile = [this] {
+                try {
+                    poll();
+                } catch (...) {
+                    abort(frame(), std::current_exception(), -1);
+                }
+            };
+        mailbox_->executor().parallelFor(count, body, meanwhile);
     }
 
     // Polls if no other thread moves messages, or none runs tasks, for a renderer that does not call poll(). Does so at
