@@ -23,7 +23,7 @@ public:
             "Where the camera is, in place of --azimuth, --elevation and --camera-distance. In the coordinates of the "
             "scene: files fill the cube from 0 to 1, or with --no-fit have their own",
             camera);
-        add("--target", target_, "X,Y,Z", "The point that it looks at; default: the centre of what there is to see",
+        add("--target", target_, "X,Y,Z", "The point that it looks at; default: the centre of the visible scene",
             camera);
         add("--up", up_, "X,Y,Z|x|y|z|-x|-y|-z",
             "Direction that is up in the image, and the axis of the orbit. In volume files y and z run downwards, "

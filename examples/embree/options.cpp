@@ -204,8 +204,8 @@ private:
               "Format in which the colour of tiles is sent; the less exact ones are for colours from 0 to alpha; other "
               "tiles are sent as float32, as are depth and what --aux writes; default float32");
         number("--error-budget", options_.errorBudget, 0, 1, "E",
-               "Use the cheapest of these formats that is certain to change colour and alpha of no pixel by more than "
-               "this, before conversion to the output; default 0: use --wire");
+               "Use the cheapest format of --wire that changes colour and alpha of no pixel by more than E, before "
+               "conversion to the output; default 0: use --wire");
         number("--min-transmittance", options_.minTransmittance, 0, 0.99, "T",
                "Leave out what is behind bricks that let less than this fraction of the light through; default 0");
         flag("--verify", options_.verify,
@@ -233,7 +233,8 @@ private:
                "volumes, without --path; otherwise 0: none. Bricks then also hold the geometry within --ao-distance of "
                "them");
         number("--ao-distance", options_.aoDistance, 1e-6, 10, "D",
-               "How far these rays look and shadows are cast, in units of the scene's largest extent; default 0.1");
+               "Length of the rays of --ao, and reach of --shadows, in units of the scene's largest extent; default "
+               "0.1");
         flag("--shadows", options_.shadows, "Shadows of surfaces and spheres on each other, as far as --ao-distance");
         number("--path", options_.pathBounces, 0, 1000, "N",
                "Path-trace opaque surfaces and spheres under a bright sky, N bounces at most; volumes are left out; "
@@ -270,14 +271,14 @@ private:
               "left eye's view in the left half, the right eye's in the right; dome: a fisheye; default perspective. "
               "dof and motion want --spp 16 or more");
         number("--aperture", options_.view.aperture, 0, 10, "R",
-               "Radius of the lens of dof, in units of the largest extent of what there is to see; default 0.05");
+               "Radius of the lens of dof, in units of the visible scene's largest extent; default 0.05");
         number("--focus", options_.view.focus, 1e-6, 1e6, "D",
-               "Distance of what is sharp with dof and at the screen with stereo, in units of the largest extent of "
-               "what there is to see; default: the distance of --target");
+               "Distance that dof shows sharp and stereo shows at the screen, in units of the visible scene's largest "
+               "extent; default: the distance of --target");
         number("--shutter", options_.view.shutter, -360, 360, "DEG",
                "Degrees of the orbit that motion blurs, up to 360; default 8");
         number("--eyes", options_.view.separation, 0, 10, "D",
-               "Distance of the eyes of stereo, in units of the largest extent of what there is to see; default 0.1");
+               "Distance of the eyes of stereo, in units of the visible scene's largest extent; default 0.1");
         number("--dome-angle", options_.view.domeAngle, 1, 360, "DEG",
                "Degrees that dome covers, up to 360; default 180");
         number("--azimuth", options_.view.azimuth, -36000, 36000, "DEG",
@@ -289,8 +290,8 @@ private:
         number("--zoom", options_.view.zoom, 1e-3, 1e4, "Z",
                "How many times as large the scene is in the image; default 1");
         number("--camera-distance", options_.view.distance, 0, 1000, "D",
-               "Distance from the target, in units of the largest extent of what there is to see; default: far enough "
-               "that all of it is in the image, from every side");
+               "Distance from the target, in units of the visible scene's largest extent; default: far enough that all "
+               "of it is in the image, from every side");
     }
 
     // ---- reading the values

@@ -28,9 +28,9 @@ inline constexpr ChannelMask depthChannel = 2;
 //
 // Position and ids are those of the front input: the first input with alpha > 0 in the order of blending, which is that
 // of (depth, source, part), or the one given to OrderedBlend. An id comes from the first such input that has one. With
-// several passes, the pass with the nearest front input gives them. If several are equally near, or there are no
-// depths, the first of these passes does. So depth is sent then even if the image has none. With one pass it is sent
-// only if the operation needs it.
+// several passes, they are those of the pass with the nearest front input; among equally near ones, or without depths,
+// of the first. To compare passes, depth is sent even if the image has none. With one pass it is sent only if the
+// operation needs it.
 inline constexpr ChannelMask normalChannel =
     4; // 3 floats times alpha: over; comes out shorter than 1 where normals differ
 inline constexpr ChannelMask albedoChannel = 8;       // 3 floats times alpha: over

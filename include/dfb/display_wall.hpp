@@ -40,10 +40,10 @@ struct ToWall {
 //   wall.finish(report.frame);
 //   ... wall.image(display) on the rank that drives it
 //
-// Memory: for each display that it drives, a rank has the image that is shown, and one more for each frame (16 at most)
-// of which parts have come before its finish(). The constructor takes memory for one of these; if there is none for
-// another, the connection fails. At most `poolBytes` are on the way to such a rank. A frame without finish() keeps some
-// bytes on every rank until the next finish().
+// Memory: for each display that it drives, a rank has the image that is shown, and one image for each frame (16 at
+// most) of which parts have come and that is not finished yet. The constructor allocates the first of these. If a later
+// one cannot be allocated, the connection fails. At most `poolBytes` are on the way to such a rank. A frame without
+// finish() keeps some bytes on every rank until the next finish().
 class DisplayWall {
 public:
     // Makes a wall whose displays show images in `format`. `executor` runs its work; null: threads of its own, beside

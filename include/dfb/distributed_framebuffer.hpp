@@ -144,13 +144,14 @@ public:
     // releases the connection last waits for all ranks: this, another object on it, or your own shared_ptr.
     ~DistributedFrameBuffer() = default;
 
-    // Begins a frame. Every rank must call it, with an equal `params`. All ranks must call begin() and end() in the
-    // same order: setTile() may wait for a rank to take messages, which it does only after it has begun their frame.
-    // Copies `tileData` and `pixelData`. `failure`: an exception that was thrown while `params` were made, if any. If
-    // it is given, or if copying or newFrame() of the pixel operation throws, end() throws a FrameError with the text
-    // on all ranks, as after Frame::abort(). Waits for no other rank. Throws InvalidArgument, with nothing sent, if the
-    // frame that was begun config.framesInFlight frames ago is still open, if a field of `params` is out of range, or
-    // on a thread that may not call MPI (see Progress). Throws TransportError if the connection has failed.
+    // Begins a frame. Every rank must call it, with an equal `params`. If several frames are open, all ranks must call
+    // begin() and end() in the same order: a rank takes inputs of a frame only after its own begin() of it, and
+    // setTile() on other ranks may wait for that. Copies `tileData` and `pixelData`. `failure`: an exception that was
+    // thrown while `params` were made, if any. If it is given, or if copying or newFrame() of the pixel operation
+    // throws, end() throws a FrameError with the text on all ranks, as after Frame::abort(). Waits for no other rank.
+    // Throws InvalidArgument, with nothing sent, if the frame that was begun config.framesInFlight frames ago is still
+    // open, if a field of `params` is out of range, or on a thread that may not call MPI (see Progress). Throws
+    // TransportError if the connection has failed.
     Frame begin(const FrameConfig& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {}, const std::exception_ptr& failure = nullptr)
     {

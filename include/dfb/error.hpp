@@ -47,7 +47,7 @@ enum class ErrorKind : std::uint32_t {
     UnannouncedInput, // an input of a generation or source that nobody announced
     NegativeChildren, // an input announced fewer than zero children
     MalformedMessage, // bytes off the wire that are not a message of this framebuffer
-    Disagreement,     // ranks began a frame with different parameters, or sent more inputs than announced
+    Disagreement,     // ranks began a frame with different parameters, or inputs came after their tiles were done
     UserCode,         // an exception out of the program's code: a renderer, a camera, an operation, a codec, onTile
     Cancelled,        // a frame was cancelled, or left without end()
     TimedOut,         // a frame was not complete in time

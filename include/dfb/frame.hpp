@@ -191,8 +191,8 @@ struct FrameSums {
 struct FrameReport : FrameSums {
     std::int64_t frame = 0;
     std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why tiles are missing, if any are
-    // All: tiles that were not finished. More on the display rank: also finished tiles that have not reached it, and
-    // background tiles for which the pixel operation threw. All these tiles show the background.
+    // Tiles that were not finished. On the display rank also finished tiles that have not reached it, and background
+    // tiles for which the pixel operation threw. All these tiles show the background.
     std::int64_t tilesIncomplete = 0;
     double totalMs = 0;               // begin() to the return of end(), this rank
     double renderMs = 0;              // begin() to the call of end(), this rank

@@ -195,8 +195,8 @@ private:
 };
 
 // Writes the colours of an image to a file that most image viewers open: a PPM file, 8 bits a channel, without alpha.
-// RGBA32F becomes sRGB; 8-bit images are written as they are. The first row of the image is the uppermost of the
-// picture, also after setBottomUp(). Replaces an existing file. Not collective: call it on a
+// RGBA32F becomes sRGB; 8-bit images are written as they are. Row 0 becomes the top row: after
+// ImageCompositor::setBottomUp(true) the file is upside down. Replaces an existing file. Not collective: call it on a
 // rank that has an image. Any thread. Throws InvalidArgument if the image is empty, and then writes nothing, or if the
 // file cannot be written, which may leave a part of it.
 DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image);

@@ -26,8 +26,8 @@ struct TileHeader {
     int children = 0;         // how many inputs of generation + 1 this one announces
     std::uint32_t source = 0; // brick id, or another number; where there are no bricks, the rank
     std::uint16_t part = 0;   // to tell apart several inputs of one source
-    // For renderers: the sample number over all frames that accumulate, to seed with. Set by Frame::start; 0 in the
-    // inputs of a tile operation, which has TileInfo::firstSample.
+    // For renderers: the number of this sample over all frames that accumulate, a seed for random numbers. Set by
+    // Frame::start. 0 in the inputs of a tile operation: there the number is TileInfo::firstSample + pass.
     int sample = 0;
 };
 
@@ -216,9 +216,9 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     }
 };
 
-// A tile whose pixels lie elsewhere, such as in an image that a renderer has made by itself. They are read there and
-// mean what those of a Tile mean. All pointers point to the first pixel of the region; channels that neither the
-// operation nor the image needs may be null. A tile without colour is empty.
+// A tile whose pixels lie elsewhere in host memory, such as in an image that a renderer has made by itself. They are
+// read there and mean what those of a Tile mean. All pointers point to the first pixel of the region; channels that
+// neither the operation nor the image needs may be null. A tile without colour is empty.
 template <ChannelMask Channels, int Size>
 struct TileView : TileHeader {
     static constexpr int size = Size;

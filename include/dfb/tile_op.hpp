@@ -1,9 +1,10 @@
 // The contract of a tile operation (TileOp): how the inputs of one tile become a finished tile.
 //
-// A TileOp is a default-constructible type. A rank makes an object when a tile that it owns first needs one, for each
-// frame in flight. If owners change, an object without keepsState may serve another tile later. Calls for one tile come
-// one after the other, from any thread, so the operation needs no mutex; calls for different tiles may come at once. It
-// does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks, with its text.
+// A TileOp is a default-constructible type. The owner of a tile makes one object of it for each frame in flight, when
+// the tile first needs it. If owners change, an object without keepsState may serve another tile later. Calls for one
+// tile come one after the other, from any thread, so the operation needs no mutex; calls for different tiles may come
+// at once. It does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks, with
+// its text.
 //
 // All passes of a tile come to one object. The operation itself composites each pass (TileHeader::pass), lays each over
 // TileInfo::background, and averages them; PassImages does the last two. Inputs come in any order. Empty ones come,
@@ -31,8 +32,8 @@
 //                                                finished at once, without the inputs still announced. When these
 //                                                come, they are checked and counted, but not given to add()
 //   static constexpr bool readsInPlace = true;   inputs may come as views of a renderer's memory
-//                                                (FragmentEncoding::InPlace) or as bytes: they are read with
-//                                                forEachPixel() or a FragmentCursor, in finish(), and not through
+//                                                (FragmentEncoding::InPlace) or as bytes. The operation must read them
+//                                                in finish(), by forEachPixel() or a FragmentCursor, not by
 //                                                Fragment::color()
 //   static constexpr bool takesOrder = true;     the operation follows TileInfo::order, and does without depth then
 //   static bool opaqueHides(const TileInfo&);    whether in this frame an opaque input hides all inputs of a higher

@@ -289,8 +289,8 @@ struct Verdict {
         const std::int64_t count = sums.tilesEndedEarly == 0 ? sums.inputsLeft : 0;
         if (count == 0)
             return std::nullopt;
-        ErrorInfo info = errorInfo(ErrorKind::Disagreement, "more inputs were sent than had been announced: so many "
-                                                            "came when their tiles were finished");
+        ErrorInfo info = errorInfo(ErrorKind::Disagreement, "more inputs were sent than had been announced: some came "
+                                                            "after their tiles were finished");
         info.expected = 0;
         info.got = count;
         return info;

@@ -18,8 +18,8 @@ DFB_NAMESPACE_BEGIN
 namespace detail {
 
 // All ranks call the same members with the same values, and get the same owners: no message is needed. Keeps its memory
-// from frame to frame; only owners that have changed are a new list. For each frame, call start(), then add() for all
-// pixels that some rank has, then find().
+// from frame to frame. find() returns the same list as long as no owner changes. For each frame, call start(), then
+// add() for all pixels that some rank has, then find().
 class LinkOwners {
 public:
     // `nodeOf`: for each rank, the lowest rank of its node.

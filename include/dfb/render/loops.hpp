@@ -38,8 +38,8 @@ struct InPlace {
 
 // Makes a renderer for any loop except DeepParallelLoop out of pixels that are there already, such as an image that a
 // rank has made by itself. find(brick, view), or find(view) for ImageParallelLoop, points the planes of a TileView to
-// the pixels of view.region; a view left without colour is empty. Several threads call it at once. Pixels are copied,
-// and may change when it is called for the next tile on the same thread, unless it sets staysUntilEnd.
+// the pixels of view.region; a view left without colour is empty. Several threads call it at once. Pixels are copied
+// before find() is called again on the same thread, so it may reuse their memory, unless it sets staysUntilEnd.
 template <class Find>
 InPlace<Find> inPlace(Find find)
 {
@@ -218,9 +218,8 @@ namespace detail {
 class FromWorld {
 public:
     // Sets config.order and config.owners. `isOrdered`: inputs come in an order that the loop was given, without depth.
-    // Returns the exception that the camera has thrown, or null. begin() has to get it, so that it comes out of the
-    // frame, on all ranks. Inputs of other ranks may be here already: without the order, they are not what this rank
-    // expects.
+    // Returns the camera's exception, or null. Pass it to begin(), which then makes the frame fail on all ranks. Call
+    // begin() in any case: other ranks may have sent inputs of this frame already.
     template <class FrameBuffer, class Camera>
     std::exception_ptr set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
                            bool isOrdered = false)

@@ -434,10 +434,11 @@ private:
 };
 
 // The mixed-parallel loop for OrderedBlend. The generation of an input is its place in the order, so owners sort
-// nothing and wait for no declarations. An input behind an opaque one is not sent, nor rendered if its rank hears of
-// that in time. An input that was hidden in the last frame waits until the tile that hid it has been rendered again, at
-// most FrameBufferConfig::quiet. Use it only if one order of the bricks is right for all rays of a frame: not with an
-// extended lens or several eyes. Framebuffer, world and owner must outlive it. One thread at a time may use it.
+// nothing and wait for no declarations. With one pass and an image of colour alone, an input behind an opaque one is
+// neither rendered nor sent if its rank hears of that in time. An input that was hidden in the last frame waits until
+// the tile that hid it has been rendered again, at most FrameBufferConfig::quiet. Use it only if one order of the
+// bricks is right for all rays of a frame: not with an extended lens or several eyes. Framebuffer, world and owner must
+// outlive it. One thread at a time may use it.
 template <class FrameBuffer, class TileBrickOwner>
 class OrderedLoop {
 public:
@@ -487,7 +488,7 @@ public:
     }
 
 private:
-    // `mayWait`: puts the jobs aside of which another rank has not said yet whether it hides them.
+    // `mayWait`: sets aside the jobs that another rank may still hide.
     template <class RenderBrick>
     void renderJobs(typename FrameBuffer::Frame& frame, const RenderBrick& renderBrick, bool mayWait)
     {

@@ -7,8 +7,9 @@
 // Footprint, a convex polygon that leaves out tiles in the corners of the rectangle, or a std::vector of either: a
 // stereo camera returns two. A camera may also have
 //   std::optional<Vec3> commonEye() const;
-// the point where all its rays begin, if there is one: then AlphaBlend need not sort (FrameConfig::order). Parallel
-// rays come from infinitely far away: its coordinates are +-infinity, or NaN along an axis along which no ray goes.
+// the point where all its rays begin, if there is one: then AlphaBlend need not sort (FrameConfig::order). For
+// parallel rays it is infinitely far away, where they come from: each coordinate is +-infinity, or NaN if the rays are
+// perpendicular to that axis.
 // Loops call both on the thread that is in start(); if they throw, the frame fails on all ranks.
 #pragma once
 

@@ -49,8 +49,8 @@ inline Vec3 toFloat(const Vec3d& v) noexcept
     return {static_cast<float>(v.x), static_cast<float>(v.y), static_cast<float>(v.z)};
 }
 
-// An axis-aligned box, in the user's unit of length. Renderers treat it as half-open, [lower, upper), so that two
-// bricks that share a face share no point.
+// An axis-aligned box, in the user's unit of length. Your renderer must treat it as half-open, [lower, upper), so
+// that a point on a face that two bricks share is drawn once.
 struct Box3 {
     Vec3 lower, upper;
 
@@ -70,9 +70,9 @@ inline bool isBox(const Box3& b) noexcept
 
 } // namespace detail
 
-// A convex region of space, with the data in it. Only in a DeepParallelLoop may it overlap another brick. Camera rays
-// see it within `bounds` only: renderers clip them to it. Its data may reach farther: ghost voxels, or geometry for
-// shadows and ambient occlusion, which secondary rays see beyond the bounds as well.
+// A region of space, with the data in it. It is convex and overlaps no other brick, except in a DeepParallelLoop.
+// Camera rays see it within `bounds` only: renderers clip them to it. Its data may reach farther: ghost voxels, or
+// geometry for shadows and ambient occlusion, which secondary rays see beyond the bounds as well.
 struct Brick {
     std::uint32_t id = 0; // equal on two ranks: the same brick, whose bounds must be equal in a SharedWorld
     Box3 bounds;
