@@ -1,5 +1,6 @@
 // FunctionRef: a reference to a callable, valid during the call to which it is an argument. It is two pointers, so a
-// function that takes one need not be a template, which would be instantiated for each lambda.
+// function that takes one need not be a template, which would be instantiated for each lambda. A FunctionRef that
+// returns nothing drops what the callable returns.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -18,7 +19,16 @@ public:
     template <class Callable>
     FunctionRef(const Callable& callable)
         : callable_(&callable), call_([](const void* any, Arguments... arguments) -> Result {
-              return (*static_cast<const Callable*>(any))(std::forward<Arguments>(arguments)...);
+              return static_cast<Result>((*static_cast<const Callable*>(any))(std::forward<Arguments>(arguments)...));
+          })
+    {
+    }
+    template <class Return>
+    FunctionRef(Return (&function)(Arguments...))
+        : callable_(reinterpret_cast<const void*>(&function)),
+          call_([](const void* any, Arguments... arguments) -> Result {
+              return static_cast<Result>(reinterpret_cast<Return (*)(Arguments...)>(const_cast<void*>(any))(
+                  std::forward<Arguments>(arguments)...));
           })
     {
     }

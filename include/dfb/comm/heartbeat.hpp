@@ -41,7 +41,7 @@ public:
 
     bool isOn() const noexcept { return !peers_.empty(); }
 
-    // A rank that has sent nothing for this long is asked. It must answer in less time than this.
+    // A rank that has sent nothing for this long is asked. It must answer in the rest of the time-out.
     Duration patience() const noexcept { return timeout_ / 4; }
     // Whether it is time to call due().
     bool isDue(Time now) const { return now - last_ >= timeout_ / 32; }

@@ -14,6 +14,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <mutex>
 #include <utility>
 #include <vector>
 
@@ -181,11 +182,7 @@ public:
         params.declared = true;
         auto frame = fb_.begin(params, tileData, pixelData);
         bricks_.template forEach<void>(fb_, frame, world_, camera, [&](const Brick& brick, auto& tile) {
-            // Kept for the thread's next job, as a renderer that waits may be given another one meanwhile.
-            static thread_local std::unique_ptr<DeepTile> spare;
-            std::unique_ptr<DeepTile> deep = std::move(spare);
-            if (!deep || deep->maxSegments() != maxSegments_)
-                deep = std::make_unique<DeepTile>(maxSegments_);
+            std::unique_ptr<DeepTile> deep = takeSpare();
             deep->reset(tile);
             renderBrick(brick, *deep);
             for (int layer = 0; layer == 0 || layer < deep->layers(); ++layer) {
@@ -199,7 +196,8 @@ public:
             }
             if (deep->errorBound() > 0)
                 frame.noteMergeError(tile.tile, deep->errorBound());
-            spare = std::move(deep);
+            const std::lock_guard<std::mutex> lock(mutex_);
+            spare_.push_back(std::move(deep));
         });
         return frame;
     }
@@ -214,10 +212,22 @@ public:
     }
 
 private:
+    std::unique_ptr<DeepTile> takeSpare()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (spare_.empty())
+            return std::make_unique<DeepTile>(maxSegments_);
+        std::unique_ptr<DeepTile> deep = std::move(spare_.back());
+        spare_.pop_back();
+        return deep;
+    }
+
     FrameBuffer& fb_;
     const World& world_;
     int maxSegments_;
     detail::OwnBricks bricks_;
+    std::mutex mutex_;
+    std::vector<std::unique_ptr<DeepTile>> spare_;
 };
 
 DFB_NAMESPACE_END
