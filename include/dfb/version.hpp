@@ -28,6 +28,10 @@
 #error "dfb needs C++17: compile with -std=c++17"
 #endif
 
+#if defined(None) || defined(Always)
+#error "dfb: X11 defines None and Always as macros: include dfb before X11, or #undef both in between"
+#endif
+
 #if defined(__FAST_MATH__) || defined(__ASSOCIATIVE_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
 #error \
     "dfb: -ffast-math and parts of it remove infinities, NaNs and rounding that compositing relies on; compile without"

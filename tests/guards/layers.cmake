@@ -14,8 +14,8 @@ set(door_of_tbb tbb_executor.hpp)
 set(calls_of_mpi
     Abort Cancel Comm_create_keyval Comm_delete_attr Comm_free Comm_free_keyval Comm_get_attr Comm_idup
     Comm_rank Comm_set_attr Comm_set_errhandler Comm_size Comm_test_inter Error_class Error_string Finalize
-    Get_count Get_processor_name Iallgather Iallreduce Ialltoall Ibarrier Ibcast Init_thread Irecv Isend Issend
-    Query_thread Request Test Test_cancelled Testall Testsome)
+    Get_count Get_library_version Get_processor_name Iallgather Iallreduce Ialltoall Ibarrier Ibcast Init_thread Irecv
+    Isend Issend Query_thread Request Test Test_cancelled Testall Testsome)
 
 # Headers that must not include others, even indirectly. Rooms are folders. Of the headers at the root, those that
 # define a tile and what is made of it count as pixels.

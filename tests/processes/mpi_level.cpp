@@ -1,7 +1,7 @@
 // A program that has initialised MPI at any thread level gets its images with default settings. On each rank a progress
 // thread moves messages or, below MPI_THREAD_MULTIPLE, the caller does, and then no other thread calls MPI. Also tests
-// the errors of the constructor if Progress::Thread is not possible, and if MPI is not initialised. MPI can be
-// initialised only once in a process:
+// the errors of the constructor if Progress::Thread is not possible, and if MPI is not initialised, or not the one of the
+// headers. MPI can be initialised only once in a process:
 //   mpirun -n 2 mpi_level mixed      rank 0 with MPI_Init, the others at MPI_THREAD_MULTIPLE
 // Returns 0 if all is well.
 #include <dfb/dfb.hpp>
@@ -13,6 +13,7 @@
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 #include <functional>
 #include <memory>
 #include <string>
@@ -40,6 +41,8 @@ std::thread::id mainThread;
 std::atomic<int> callsElsewhere{0}; // of MPI, by other threads than that
 
 std::atomic<int> sends{0};
+
+bool isOtherMpi = false; // then MPI calls itself by another name
 
 void noteCall() { callsElsewhere += std::this_thread::get_id() != mainThread; }
 
@@ -267,6 +270,20 @@ int MPI_Testall(int count, MPI_Request requests[], int* done, MPI_Status statuse
     return PMPI_Testall(count, requests, done, statuses);
 }
 
+int MPI_Get_library_version(char* text, int* length)
+{
+#if defined(OPEN_MPI)
+    const std::string other = "MPICH Version: 4.0.2\nand more";
+#else
+    const std::string other = "Open MPI v4.1.4, and more";
+#endif
+    if (!isOtherMpi)
+        return PMPI_Get_library_version(text, length);
+    std::strcpy(text, other.c_str());
+    *length = static_cast<int>(other.size());
+    return MPI_SUCCESS;
+}
+
 int MPI_Test(MPI_Request* request, int* done, MPI_Status* status)
 {
     noteCall();
@@ -284,6 +301,11 @@ int main(int argc, char** argv)
         const char* rank = std::getenv("PMI_RANK") ? std::getenv("PMI_RANK") : std::getenv("OMPI_COMM_WORLD_RANK");
         asked = rank && std::atoi(rank) == 0 ? "single" : "multiple";
     }
+    isOtherMpi = true;
+    const std::string other = transportErrorOf(dfb::Progress::Auto);
+    isOtherMpi = false;
+    check(has(other, "transport failure") && has(other, "compiled for") && has(other, "of this process is"),
+          "headers of another MPI", other);
     for (const auto progress : {dfb::Progress::Auto, dfb::Progress::Thread, dfb::Progress::Caller}) {
         const std::string text = transportErrorOf(progress);
         check(has(text, "transport failure") && has(text, "not initialised"), "before MPI_Init", text);

@@ -4,6 +4,8 @@
 
 #include "errors.hpp"
 
+#include <dfb/comm/mpi_calls.hpp>
+
 namespace dfb_icet {
 
 namespace {
@@ -65,7 +67,10 @@ MPI_Comm mpiOf(IceTCommunicator communicator)
 
 extern "C" IceTCommunicator icetCreateMPICommunicator(MPI_Comm comm)
 {
-    return guarded("icetCreateMPICommunicator", [&] { return make(comm); });
+    return guarded("icetCreateMPICommunicator", [&] {
+        dfb::detail::requireMpiOfHeaders();
+        return make(comm);
+    });
 }
 
 extern "C" void icetDestroyMPICommunicator(IceTCommunicator communicator)

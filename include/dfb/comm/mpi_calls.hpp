@@ -10,6 +10,7 @@
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 #include <thread>
 
 DFB_NAMESPACE_BEGIN
@@ -48,6 +49,26 @@ inline bool mpiSays(int (*ask)(int*))
     int answer = 0;
     ask(&answer);
     return answer != 0;
+}
+
+// Throws TransportError if this code was compiled for Open MPI and another MPI is there when it runs, or the other way
+// round: they do not understand each other's communicators. MPICH and its relatives do.
+inline void requireMpiOfHeaders()
+{
+    char text[16384] = ""; // MPI_MAX_LIBRARY_VERSION_STRING of the other MPI may be larger than that of this one
+    int length = 0;
+    MPI_Get_library_version(text, &length);
+    const auto says = [&text](const char* name) { return std::strstr(text, name) != nullptr; };
+#if defined(OPEN_MPI)
+    const char* const compiledFor = "Open MPI";
+    const bool isOther = !says("Open MPI") && (says("MPICH") || says("Intel(R) MPI"));
+#else
+    const char* const compiledFor = "MPICH or a relative of it";
+    const bool isOther = says("Open MPI");
+#endif
+    if (isOther)
+        throw TransportError(printed("dfb was compiled for %s, but the MPI of this process is %.*s: compile dfb for it",
+                                     compiledFor, static_cast<int>(std::strcspn(text, ",\n")), text));
 }
 
 // Ends the process, and says why, if MPI_Finalize() is called while this object lives. For transports that another

@@ -50,11 +50,12 @@ public:
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // the most that one call sends: counts are ints
 
     // Collective over `communicator`. Waits for all ranks. Throws InvalidArgument for MPI_COMM_NULL or an
-    // intercommunicator. Throws TransportError if MPI is not initialised, or is finalised, and below
-    // MPI_THREAD_SERIALIZED on any thread but the one that initialised it. Throws TransportError on all ranks if they
-    // were built with different packet formats, or if one of them cannot make its transport; the error then has that
-    // rank and the reason, such as that `progress` is Thread and MPI is below MPI_THREAD_MULTIPLE there. Only if a
-    // collective of MPI fails on one rank, or finds no memory there for its result, the others wait.
+    // intercommunicator. Throws TransportError if MPI is not initialised, or is finalised, or is not the
+    // one of the headers, and below MPI_THREAD_SERIALIZED on any thread but the one that initialised it. Throws
+    // TransportError on all ranks if they were built with different packet formats, or if one of them cannot make its
+    // transport; the error then has that rank and the reason, such as that `progress` is Thread and MPI is below
+    // MPI_THREAD_MULTIPLE there. Only if a collective of MPI fails on one rank, or finds no memory there for its
+    // result, the others wait.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : onlyThread_(onlyThread()),
           noFinalize_(progress != Progress::Caller && detail::mpiLevel() == MPI_THREAD_MULTIPLE),
@@ -187,6 +188,7 @@ private:
     // The only thread that may call MPI; none if all may.
     static std::thread::id onlyThread()
     {
+        detail::requireMpiOfHeaders();
         const int level = detail::mpiLevel();
         if (level >= MPI_THREAD_SERIALIZED)
             return {};
