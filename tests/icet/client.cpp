@@ -62,6 +62,8 @@ IceTContext makeContext()
     IceTContext context = icetCreateContext(communicator);
     icetDestroyMPICommunicator(communicator);
     icetDiagnostics(ICET_DIAG_OFF);
+    expect(!icetGetStrategyName(), "the name of no strategy");
+    expectError(ICET_INVALID_ENUM, "the name of no strategy");
     icetStrategy(ICET_STRATEGY_REDUCE);
     return context;
 }
@@ -159,6 +161,18 @@ void trySettings()
         icetGetBooleanv(ICET_ORDERED_COMPOSITE, &state);
         expect(state == isOn, "an option that was set");
     }
+    expect(icetGetStrategyName() == std::string("Reduce"), "the name of a strategy");
+    const std::vector<IceTInt> twice{rank, rank}, self{rank}, none{ranks};
+    icetDataReplicationGroup(2, twice.data());
+    expectError(ICET_INVALID_VALUE, "a group that has a rank twice");
+    icetDataReplicationGroup(1, none.data());
+    expectError(ICET_INVALID_VALUE, "a group without this rank");
+    icetDataReplicationGroup(1, self.data());
+    const double before = icetWallTime();
+    expect(icetWallTime() >= before, "a clock that goes forward");
+    IceTVoid* pointer = nullptr;
+    icetGetPointerv(7, &pointer);
+    expectError(ICET_INVALID_ENUM, "an unknown pointer");
     expect(icetImageIsNull(icetImageNull()), "an image that is null");
     IceTInt value = 0;
     icetGetIntegerv(0x7f, &value);

@@ -12,6 +12,8 @@
 
 #include <mpi.h>
 
+#include <algorithm>
+#include <array>
 #include <cfloat>
 #include <cstdio>
 #include <cstdlib>
@@ -244,6 +246,7 @@ void read(const Api& api, IceTImage image, Outcome& out)
         IceTUByte* own = api.icetImageGetColorub(image);
         expect(std::equal(out.bytes.begin(), out.bytes.end(), own), "icetImageGetColorub");
         expect(reinterpret_cast<IceTUByte*>(api.icetImageGetColorui(image)) == own, "icetImageGetColorui");
+        expect(reinterpret_cast<const IceTUByte*>(api.icetImageGetColorcui(image)) == own, "icetImageGetColorcui");
         std::fill_n(own, 4 * count, IceTUByte{77});
         expect(api.icetImageGetColorcub(image) == own, "a changed image");
     } else if (out.colorFormat != ICET_IMAGE_COLOR_NONE) {
@@ -530,6 +533,27 @@ private:
                                                            {ICET_IS_DRAWING_FRAME, 1}})
             expect(integers(dfb_, name, count) == integers(icet_, name, count),
                    "state " + std::to_string(name) + " is another");
+        for (const bool single : {false, true}) {
+            const auto name = single ? &Api::icetGetSingleImageStrategyName : &Api::icetGetStrategyName;
+            expect(std::string((dfb_.*name)()) == (icet_.*name)(), "the name of a strategy");
+        }
+        expect(dfb_.icetIsEnabled(ICET_FLOATING_VIEWPORT) == icet_.icetIsEnabled(ICET_FLOATING_VIEWPORT), "an option");
+        for (const Api* api : {&dfb_, &icet_}) { // in the other types
+            IceTEnum mode = 0;
+            IceTBitField format = 0;
+            std::array<IceTFloat, 4> color{};
+            std::array<IceTDouble, 4> same{};
+            IceTVoid* callback = nullptr;
+            api->icetGetEnumv(ICET_COMPOSITE_MODE, &mode);
+            api->icetGetBitFieldv(ICET_COLOR_FORMAT, &format);
+            api->icetGetFloatv(ICET_TRUE_BACKGROUND_COLOR, color.data());
+            api->icetGetDoublev(ICET_TRUE_BACKGROUND_COLOR, same.data());
+            api->icetGetPointerv(ICET_DRAW_FUNCTION, &callback);
+            expect(static_cast<IceTInt>(mode) == integers(icet_, ICET_COMPOSITE_MODE, 1)[0], "an enumerator");
+            expect(static_cast<IceTInt>(format) == integers(icet_, ICET_COLOR_FORMAT, 1)[0], "bits");
+            expect(std::equal(color.begin(), color.end(), same.begin()), "floats");
+            expect(callback == reinterpret_cast<IceTVoid*>(draw), "the draw callback");
+        }
         for (const IceTEnum name : {ICET_RENDER_TIME, ICET_COMPOSITE_TIME, ICET_TOTAL_DRAW_TIME}) {
             double seconds = -1;
             dfb_.icetGetDoublev(name, &seconds);

@@ -195,6 +195,20 @@ extern "C" void icetDataReplicationGroupColor(IceTInt color)
     });
 }
 
+extern "C" void icetDataReplicationGroup(IceTInt size, const IceTInt* processes)
+{
+    inContext("icetDataReplicationGroup", [&](IceTContextStruct& context) {
+        const std::vector<int> group(processes, processes + std::max(size, 0));
+        std::vector<int> ranks = group;
+        std::sort(ranks.begin(), ranks.end());
+        const bool isSet = std::adjacent_find(ranks.begin(), ranks.end()) == ranks.end();
+        if (!isSet || !std::binary_search(ranks.begin(), ranks.end(), context.rank()) || ranks.front() < 0
+            || ranks.back() >= context.size())
+            throw Error(ICET_INVALID_VALUE, "a group has different ranks, and the calling one among them");
+        context.replicas = group;
+    });
+}
+
 extern "C" void icetGLInitialize()
 {
     inContext("icetGLInitialize", [](IceTContextStruct& context) { context.hasGl = true; });

@@ -166,6 +166,10 @@ const IceTUByte* icetImageGetColorcub(const IceTImage image)
 {
     return guarded("icetImageGetColorcub", [&] { return static_cast<const IceTUByte*>(withBytes(image).color); });
 }
+const IceTUInt* icetImageGetColorcui(const IceTImage image)
+{
+    return guarded("icetImageGetColorcui", [&] { return static_cast<const IceTUInt*>(withBytes(image).color); });
+}
 const IceTFloat* icetImageGetColorcf(const IceTImage image)
 {
     return guarded("icetImageGetColorcf", [&] { return static_cast<const IceTFloat*>(withFloats(image).color); });

@@ -4,6 +4,7 @@
 
 #include <cstdio>
 #include <cstring>
+#include <map>
 #include <set>
 #include <type_traits>
 
@@ -162,7 +163,7 @@ void get(const char* function, IceTEnum name, Number* out)
         }
         for (std::size_t i = 0; i < values.size(); ++i)
             out[i] = static_cast<Number>(
-                static_cast<std::conditional_t<sizeof(Number) < 8, std::int64_t, double>>(values[i]));
+                static_cast<std::conditional_t<std::is_integral_v<Number>, std::int64_t, double>>(values[i]));
     });
 }
 
@@ -175,8 +176,47 @@ void set(const char* function, IceTEnum option, bool value)
     });
 }
 
+using Names = std::map<IceTEnum, const char*>;
+
+const Names& strategies()
+{
+    static const Names names{{ICET_STRATEGY_DIRECT, "Direct"},
+                             {ICET_STRATEGY_SEQUENTIAL, "Sequential"},
+                             {ICET_STRATEGY_SPLIT, "Split"},
+                             {ICET_STRATEGY_REDUCE, "Reduce"},
+                             {ICET_STRATEGY_VTREE, "Virtual Tree"}};
+    return names;
+}
+
+const Names& singleImageStrategies()
+{
+    static const Names names
+    {
+        {ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC, "Automatic"}, {ICET_SINGLE_IMAGE_STRATEGY_BSWAP, "Binary Swap"},
+            {ICET_SINGLE_IMAGE_STRATEGY_TREE, "Binary Tree"}, {ICET_SINGLE_IMAGE_STRATEGY_RADIXK, "Radix-k"},
+#if defined(ICET_SINGLE_IMAGE_STRATEGY_RADIXKR)
+            {ICET_SINGLE_IMAGE_STRATEGY_RADIXKR, "Radix-kr"},
+            {ICET_SINGLE_IMAGE_STRATEGY_BSWAP_FOLDING, "Folded Binary Swap"},
+#endif
+    };
+    return names;
+}
+
+const char* nameOf(const char* function, IceTEnum Settings::*setting, const Names& names)
+{
+    const char* name = nullptr;
+    inContext(function, [&](IceTContextStruct& context) {
+        const auto found = names.find(context.settings.*setting);
+        if (found == names.end())
+            throw Error(ICET_INVALID_ENUM, "no strategy is set: call icetStrategy()");
+        name = found->second;
+    });
+    return name;
+}
+
 // Sets one value, which must be one of `possible`.
-void choose(const char* function, IceTEnum Settings::*setting, IceTEnum value, const std::set<IceTEnum>& possible)
+template <class Possible>
+void choose(const char* function, IceTEnum Settings::*setting, IceTEnum value, const Possible& possible)
 {
     inContext(function, [&](IceTContextStruct& context) {
         requireNotDrawing(context);
@@ -199,45 +239,67 @@ void sayThatStrategiesDoNothing()
 extern "C" {
 
 void icetGetDoublev(IceTEnum name, IceTDouble* out) { get("icetGetDoublev", name, out); }
+void icetGetFloatv(IceTEnum name, IceTFloat* out) { get("icetGetFloatv", name, out); }
 void icetGetIntegerv(IceTEnum name, IceTInt* out) { get("icetGetIntegerv", name, out); }
+void icetGetEnumv(IceTEnum name, IceTEnum* out) { get("icetGetEnumv", name, out); }
+void icetGetBitFieldv(IceTEnum name, IceTBitField* out) { get("icetGetBitFieldv", name, out); }
 void icetGetBooleanv(IceTEnum name, IceTBoolean* out) { get("icetGetBooleanv", name, out); }
+
+void icetGetPointerv(IceTEnum name, IceTVoid** out)
+{
+    inContext("icetGetPointerv", [&](IceTContextStruct& context) {
+        if (name != ICET_DRAW_FUNCTION)
+            throw Error(ICET_INVALID_ENUM, "the only pointer here is ICET_DRAW_FUNCTION");
+        *out = reinterpret_cast<IceTVoid*>(context.settings.draw);
+    });
+}
+
+IceTBoolean icetIsEnabled(IceTEnum option)
+{
+    IceTBoolean isEnabled = ICET_FALSE;
+    get("icetIsEnabled", option, &isEnabled);
+    return isEnabled;
+}
+
+IceTDouble icetWallTime() { return MPI_Wtime(); }
+
+const char* icetGetStrategyName() { return nameOf("icetGetStrategyName", &Settings::strategy, strategies()); }
+const char* icetGetSingleImageStrategyName()
+{
+    return nameOf("icetGetSingleImageStrategyName", &Settings::singleImageStrategy, singleImageStrategies());
+}
 
 void icetEnable(IceTEnum option) { set("icetEnable", option, true); }
 void icetDisable(IceTEnum option) { set("icetDisable", option, false); }
 
 void icetSetColorFormat(IceTEnum format)
 {
-    choose("icetSetColorFormat", &Settings::colorFormat, format, {
-        ICET_IMAGE_COLOR_NONE, ICET_IMAGE_COLOR_RGBA_UBYTE, ICET_IMAGE_COLOR_RGBA_FLOAT,
+    choose(
+        "icetSetColorFormat", &Settings::colorFormat, format, std::set<IceTEnum> {
+            ICET_IMAGE_COLOR_NONE, ICET_IMAGE_COLOR_RGBA_UBYTE, ICET_IMAGE_COLOR_RGBA_FLOAT,
 #if defined(ICET_IMAGE_COLOR_RGB_FLOAT)
-            ICET_IMAGE_COLOR_RGB_FLOAT
+                ICET_IMAGE_COLOR_RGB_FLOAT
 #endif
-    });
+        });
 }
 void icetSetDepthFormat(IceTEnum format)
 {
-    choose("icetSetDepthFormat", &Settings::depthFormat, format, {ICET_IMAGE_DEPTH_NONE, ICET_IMAGE_DEPTH_FLOAT});
+    choose("icetSetDepthFormat", &Settings::depthFormat, format,
+           std::set<IceTEnum>{ICET_IMAGE_DEPTH_NONE, ICET_IMAGE_DEPTH_FLOAT});
 }
 void icetCompositeMode(IceTEnum mode)
 {
-    choose("icetCompositeMode", &Settings::mode, mode, {ICET_COMPOSITE_MODE_Z_BUFFER, ICET_COMPOSITE_MODE_BLEND});
+    choose("icetCompositeMode", &Settings::mode, mode,
+           std::set<IceTEnum>{ICET_COMPOSITE_MODE_Z_BUFFER, ICET_COMPOSITE_MODE_BLEND});
 }
 void icetStrategy(IceTEnum strategy)
 {
-    choose("icetStrategy", &Settings::strategy, strategy,
-           {ICET_STRATEGY_DIRECT, ICET_STRATEGY_SEQUENTIAL, ICET_STRATEGY_SPLIT, ICET_STRATEGY_REDUCE,
-            ICET_STRATEGY_VTREE});
+    choose("icetStrategy", &Settings::strategy, strategy, strategies());
     sayThatStrategiesDoNothing();
 }
 void icetSingleImageStrategy(IceTEnum strategy)
 {
-    choose("icetSingleImageStrategy", &Settings::singleImageStrategy, strategy, {
-        ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC, ICET_SINGLE_IMAGE_STRATEGY_BSWAP, ICET_SINGLE_IMAGE_STRATEGY_TREE,
-            ICET_SINGLE_IMAGE_STRATEGY_RADIXK,
-#if defined(ICET_SINGLE_IMAGE_STRATEGY_RADIXKR)
-            ICET_SINGLE_IMAGE_STRATEGY_RADIXKR, ICET_SINGLE_IMAGE_STRATEGY_BSWAP_FOLDING
-#endif
-    });
+    choose("icetSingleImageStrategy", &Settings::singleImageStrategy, strategy, singleImageStrategies());
     sayThatStrategiesDoNothing();
 }
 
