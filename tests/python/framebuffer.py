@@ -148,6 +148,16 @@ with dfb.FrameBuffer(None, 64, 64) as left:
         self.assertNotIn(99, sum(seen, []))
         self.assertLessEqual(len(seen), 12)
 
+    def test_bytes(self):
+        """Colours of uint8 are levels, as those of images are."""
+        def gray(brick, tile):
+            tile.rgba = np.full((tile.height, tile.width, 4), 51, np.uint8)
+
+        everywhere = dfb.Brick(1, (-50, -50, -50), (50, 50, 50))
+        with dfb.FrameBuffer(None, WIDTH, HEIGHT) as fb:
+            fb.render([everywhere], CAMERA, gray)
+            np.testing.assert_array_equal(fb.image, 51)
+
     def test_tiles(self):
         """They lie where they say, and may be replaced."""
         tiles = []

@@ -48,7 +48,7 @@ enum dfb_blend {
 
 // Pixels of the picture: premultiplied RGBA, row by row from the top.
 enum dfb_format {
-    DFB_RGBA8 = 0,  // 8 bits a channel, linear
+    DFB_RGBA8 = 0,  // 8 bits a channel, linear; also for images that are encoded for a display already
     DFB_SRGBA8 = 1, // 8 bits a channel, colour through the sRGB curve, alpha linear
     DFB_RGBA32F = 2 // floats, linear
 };

@@ -86,7 +86,8 @@ void addTiles(py::module_& module)
 {
     py::class_<PythonTile>(module, "Tile", "The pixels that a renderer is asked for.")
         .def_readwrite("rgba", &PythonTile::rgba,
-                       "Premultiplied linear colours, (height, width, 4) of float32: fill them.")
+                       "Premultiplied linear colours, (height, width, 4) of float32: fill them. An array of uint8 in "
+                       "their place has levels: 255 is 1.")
         .def_readwrite("depth", &PythonTile::depth, "Depths, (height, width) of float32, that grow away from the eye.")
         .def_readonly("x0", &PythonTile::x0, "The column of the picture that its first one is.")
         .def_readonly("y0", &PythonTile::y0, "The row of the picture that its first one is; 0 is on top.")
@@ -137,6 +138,9 @@ PYBIND11_MODULE(_dfb, module)
         }
     });
 
+    if (py::dtype::of<float>().itemsize() != sizeof(float))
+        throw py::import_error("dfb was built with a pybind11 that does not understand numpy 2: build it with pybind11 "
+                               "2.12 or later, or install numpy<2");
     module.attr("version") = dfb::detail::printed("%d.%d.%d", DFB_VERSION_MAJOR, DFB_VERSION_MINOR, DFB_VERSION_PATCH);
 #if defined(DFB_HAS_MPI)
     module.attr("has_mpi") = true;

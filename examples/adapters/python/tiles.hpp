@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <cstddef>
+#include <cstdint>
 #include <limits>
 #include <string>
 #include <vector>
@@ -34,13 +35,13 @@ inline py::array_t<float> emptyDepths(int width, int height)
 }
 
 // Converts `object` to a contiguous array of this type. Throws InvalidArgument unless it has `channels` numbers for
-// each pixel of a region. 0 channels: one number, without an axis for channels.
+// each pixel of a region. 0 channels: one number, without an axis for channels. Colours of uint8 are levels.
 template <class Number>
 using PixelArray = py::array_t<Number, py::array::c_style | py::array::forcecast>;
 template <class Number>
 PixelArray<Number> pixelsOf(const py::object& object, const dfb::Region& region, int channels, const char* name)
 {
-    const auto array = PixelArray<Number>::ensure(object);
+    auto array = PixelArray<Number>::ensure(object);
     std::vector<py::ssize_t> shape{region.height(), region.width()};
     if (channels > 0)
         shape.push_back(channels);
@@ -49,6 +50,10 @@ PixelArray<Number> pixelsOf(const py::object& object, const dfb::Region& region,
     if (!fits)
         throw dfb::InvalidArgument(std::string(name) + " is " + (array ? shapeOf(array) : shown(object))
                                    + ": it must be an array " + std::string(py::str(py::tuple(py::cast(shape)))));
+    if (channels == 4 && py::isinstance<py::array_t<std::uint8_t>>(object)) {
+        Number* const levels = array.mutable_data(); // of a copy, as it had another type
+        std::transform(levels, levels + array.size(), levels, [](Number level) { return level / 255; });
+    }
     return array;
 }
 
