@@ -341,6 +341,8 @@ private:
         // This waits a little longer than for a message: the rank that misses a message has more to say than those that
         // wait for it.
         await([this] { return allHaveCome(); }, [this] { return whoHasNotCome(options_.timeLimit); }, soon_);
+        // The announcement must leave even if this rank does not poll in what comes next, such as a constructor.
+        waitUntil([this] { return control_.quiet(); }, Clock::now() + std::chrono::milliseconds(100));
     }
 
     // --- waiting
