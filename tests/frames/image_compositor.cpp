@@ -2,6 +2,7 @@
 // code. In one process and over MPI (everywhere.hpp).
 
 #include <dfb/image_compositor.hpp>
+#include <dfb/render/shared_world.hpp>
 
 #include "everywhere.hpp"
 
@@ -385,6 +386,14 @@ struct Places {
         const std::string wrong =
             scene::outcomeOf([&] { compositor.composite(dfb::InputImage(pixel), isLast ? -1 : compositor.rank()); });
         result.expect(wrong.find("place -1 in an order") != std::string::npos, "without a place: " + wrong);
+
+        // Places that are found from a box of each rank.
+        const auto at = static_cast<float>(-compositor.rank());
+        const dfb::Box3 box{{0, 0, at}, {1, 1, at + 1}};
+        const dfb::SharedWorld world(compositor, dfb::World({{static_cast<std::uint32_t>(compositor.rank()), box}}));
+        const std::vector<int> order = dfb::visibilityOrder(world, dfb::Vec3{0, 0, 9});
+        result.expect(static_cast<int>(order.size()) == compositor.size() && std::is_sorted(order.begin(), order.end()),
+                      "the order of the ranks' boxes");
         return result;
     }
 };
@@ -533,7 +542,10 @@ TEST_CASE("A pixel at infinite depth is in the picture whatever form its image h
 
 TEST_CASE("A pixel at farDepth is empty in a picture with an order", "[image_compositor]") { everywhere<FarInOrder>(); }
 
-TEST_CASE("Only a rank that shows something needs a place in the order", "[image_compositor]") { everywhere<Places>(); }
+TEST_CASE("Only a rank that shows something needs a place in the order, which its box gives", "[image_compositor]")
+{
+    everywhere<Places>();
+}
 
 TEST_CASE("An image that cannot be fails the picture on all ranks, and resize() changes its size", "[image_compositor]")
 {

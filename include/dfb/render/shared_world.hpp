@@ -3,8 +3,8 @@
 #pragma once
 
 #include <dfb/base/detect.hpp>
+#include <dfb/base/function_ref.hpp>
 #include <dfb/compiled.hpp>
-#include <dfb/framebuffer_base.hpp>
 #include <dfb/render/visibility.hpp>
 
 #include <algorithm>
@@ -26,25 +26,33 @@ struct SharedBrick : Brick {
 // number of all bricks.
 class SharedWorld {
 public:
-    // Gathers the bricks of all ranks. Bricks with the same id are the same brick. Collective, outside frames. Waits
-    // and throws as DistributedFrameBuffer::allGather(). Also throws InvalidArgument on all ranks if the bounds of one
-    // brick differ between ranks, or if the bricks of a rank cannot be read.
-    SharedWorld(FrameBufferBase& fb, const World& world);
+    // Gathers the bricks of all ranks of a framebuffer or an ImageCompositor. Bricks with the same id are the same
+    // brick. Collective, outside frames. Waits and throws as DistributedFrameBuffer::allGather(). Also throws
+    // InvalidArgument on all ranks if the bounds of one brick differ between ranks, or if the bricks of a rank cannot
+    // be read.
+    template <class Object>
+    SharedWorld(Object& object, const World& world)
+        : SharedWorld(world, [&object](const Bytes& own) { return object.allGather(own, "SharedWorld()"); })
+    {
+    }
 
     // Sorted by ascending id.
     const std::vector<SharedBrick>& bricks() const noexcept { return bricks_; }
 
 private:
+    using Bytes = std::vector<std::byte>;
+    using Gather = detail::FunctionRef<std::vector<Bytes>(const Bytes&)>;
+    SharedWorld(const World& world, const Gather& gather);
+
     std::vector<SharedBrick> bricks_;
 };
 
 #if DFB_HAS_BODIES
-DFB_COMPILED_ONCE SharedWorld::SharedWorld(FrameBufferBase& fb, const World& world)
+DFB_COMPILED_ONCE SharedWorld::SharedWorld(const World& world, const Gather& gather)
 {
     static_assert(std::is_trivially_copyable_v<Brick>);
     const auto* first = reinterpret_cast<const std::byte*>(world.bricks().data());
-    const std::vector<std::vector<std::byte>> all =
-        fb.allGather({first, first + world.bricks().size() * sizeof(Brick)}, "SharedWorld()");
+    const std::vector<Bytes> all = gather({first, first + world.bricks().size() * sizeof(Brick)});
     std::vector<std::pair<Brick, int>> held;
     for (std::size_t rank = 0; rank < all.size(); ++rank) {
         if (all[rank].size() % sizeof(Brick) != 0)
