@@ -68,6 +68,33 @@ class Compositor(unittest.TestCase):
                 assert_exact(image, expected)
                 np.testing.assert_array_equal(depth, nearest_depth)
 
+    def test_place(self):
+        """From front to back, also seen from behind; wrong boxes on one rank are an error on all."""
+        def rank(comm):
+            with dfb.ImageCompositor(comm, 8, 8, "order") as compositor:
+                left = (1, 2, 0)[comm.rank]
+                box = (left, 0, 0), (left + 1, 1, 1)
+                places = [compositor.place(*box, eye) for eye in ((-5, 0, 0), (9.5, 0.5, 0.5), np.array([1.5, 0, 9]))]
+                wrong = []
+                for lower, upper in (("red", box[1]) if comm.rank == 1 else box, box[::-1] if comm.rank == 2 else box,
+                                     ((0, 0, 0), (1, 1, 1))):
+                    try:
+                        compositor.place(lower, upper, (0, 0, 9))
+                    except dfb.Error as error:
+                        wrong.append((error.kind, error.rank, str(error)))
+                return places, wrong
+
+        results = dfb.run_ranks(3, rank)
+        self.assertEqual([places[0] for places, _ in results], [1, 2, 0])
+        self.assertEqual([places[1] for places, _ in results], [1, 0, 2])
+        self.assertEqual([places[2] for places, _ in results], [0, 1, 2])
+        for _, wrong in results:
+            self.assertEqual([(kind, number) for kind, number, _ in wrong[:2]],
+                             [("InvalidArgument", 1), ("InvalidArgument", 2)])
+            self.assertIn("lower is 'red': it must be three floats", wrong[0][2])
+            self.assertIn("are not a box", wrong[1][2])
+            self.assertIn("overlap", wrong[2][2])
+
     def test_order(self):
         for kind in (np.uint8, np.float32):
             images = [pixels(rank, kind)[0] for rank in range(RANKS)]

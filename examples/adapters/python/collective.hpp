@@ -151,13 +151,6 @@ protected:
     }
     const dfb::FrameConfig& frame() const noexcept { return frame_; }
 
-private:
-    int open(int value) const
-    {
-        object();
-        return value;
-    }
-
     // Collective. Throws InvalidArgument on all ranks, with the reason of the lowest rank that has one, if `why` is not
     // empty everywhere. `call`: see dfb::ImageCompositor::allGather().
     void refuseTogether(const std::string& why, const char* call)
@@ -176,6 +169,13 @@ private:
         info.rank = static_cast<int>(first - reasons.begin());
         info.message.assign(reinterpret_cast<const char*>(first->data()), first->size());
         throw dfb::InvalidArgument(std::move(info));
+    }
+
+private:
+    int open(int value) const
+    {
+        object();
+        return value;
     }
 
     // Leaves the object alone in a process that was forked off: it has none of the threads that the end waits for.

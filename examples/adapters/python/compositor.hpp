@@ -5,7 +5,10 @@
 #include "collective.hpp"
 
 #include <dfb/image_compositor.hpp>
+#include <dfb/render/shared_world.hpp>
 
+#include <algorithm>
+#include <cstdint>
 #include <memory>
 #include <string>
 #include <utility>
@@ -57,6 +60,29 @@ public:
                 return object().composite(arrays.image, place, frame());
             object().startFailed(wrong, frame());
             return object().end();
+        });
+    }
+
+    // This rank's place from front to back, as seen from `eye`, if each rank has a box. Wrong arguments on one rank are
+    // an error on all.
+    int place(const py::object& lower, const py::object& upper, const py::object& eye)
+    {
+        const Use use(*this);
+        std::string why;
+        dfb::Brick own{static_cast<std::uint32_t>(object().rank()), {}};
+        dfb::Vec3 from;
+        try {
+            own.bounds = {pointOf(lower, "lower"), pointOf(upper, "upper")};
+            from = pointOf(eye, "eye");
+            if (!dfb::detail::isBox(own.bounds))
+                why = "lower and upper are not a box";
+        } catch (const dfb::InvalidArgument& error) {
+            why = error.info().message;
+        }
+        return withoutGil(*Cause::make(), [&] {
+            refuseTogether(why, "place()");
+            const auto order = dfb::visibilityOrder(dfb::SharedWorld(object(), dfb::World({own})), from);
+            return static_cast<int>(std::find(order.begin(), order.end(), object().rank()) - order.begin());
         });
     }
 

@@ -215,17 +215,6 @@ public:
     }
 
 private:
-    static dfb::Vec3 pointOf(const py::handle& brick, const char* name)
-    {
-        try {
-            const auto p = brick.attr(name).cast<std::array<float, 3>>();
-            return {p[0], p[1], p[2]};
-        } catch (const py::cast_error&) {
-            throw dfb::InvalidArgument(std::string("brick.") + name + " is " + shown(brick.attr(name))
-                                       + ": it must be three floats");
-        }
-    }
-
     static dfb::Brick brickOf(const py::handle& brick)
     {
         dfb::Brick result;
@@ -235,7 +224,7 @@ private:
             throw dfb::InvalidArgument("brick.id is " + shown(brick.attr("id"))
                                        + ": it must be an int, 0 to 2**32 - 1");
         }
-        result.bounds = {pointOf(brick, "lower"), pointOf(brick, "upper")};
+        result.bounds = {pointOf(brick.attr("lower"), "brick.lower"), pointOf(brick.attr("upper"), "brick.upper")};
         return result;
     }
 

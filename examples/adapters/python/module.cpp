@@ -183,7 +183,8 @@ PYBIND11_MODULE(_dfb, module)
             "Returns origins and unit directions, (height, width, 3) of float32, of the rays through a tile's pixels.");
 
     addCollective<Compositor, CompositorSettings>(module, "Compositor")
-        .def("composite", &Compositor::composite, "rgba"_a, "depth"_a, "options"_a);
+        .def("composite", &Compositor::composite, "rgba"_a, "depth"_a, "options"_a)
+        .def("place", &Compositor::place, "lower"_a, "upper"_a, "eye"_a);
     addCollective<FrameBuffer, FrameBufferSettings>(module, "FrameBuffer")
         .def("render", &FrameBuffer::render, "bricks"_a, "camera"_a, "draw"_a);
 

@@ -6,6 +6,7 @@
 #include <dfb/exec.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/image_compositor.hpp>
+#include <dfb/render/world.hpp>
 
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
@@ -25,6 +26,17 @@ namespace dfb_python {
 
 // Returns an argument as text for an error.
 inline std::string shown(const py::handle& value) { return py::repr(value); }
+
+// Three numbers. Throws InvalidArgument for anything else.
+inline dfb::Vec3 pointOf(const py::object& value, const std::string& name)
+{
+    try {
+        const auto p = value.cast<std::array<float, 3>>();
+        return {p[0], p[1], p[2]};
+    } catch (const py::cast_error&) {
+        throw dfb::InvalidArgument(name + " is " + shown(value) + ": it must be three floats");
+    }
+}
 
 // The value of an argument. Throws InvalidArgument if it has another type.
 template <class Value>

@@ -224,14 +224,15 @@ class ImageCompositor(_Collective):
         """Make a picture of the images of all ranks, and return its Report.
 
         rgba            premultiplied RGBA, (height, width, 4) of uint8 or float32, read in place; None: this rank has
-                        nothing. Rows may have gaps of whole pixels, or be upside down (rgba[::-1]); their pixels lie one after another. Levels
-                        of uint8 count as level / 255, rounded to float32
-        depth           (height, width) of float32, which grows away from the eye; needed unless blend="order" without depth. Copied if its
-                        rows lie differently from those of rgba, else read in place
+                        nothing. Rows may have gaps of whole pixels, or be upside down (rgba[::-1]); their pixels
+                        lie one after another. Levels of uint8 count as level / 255, rounded to float32
+        depth           (height, width) of float32, which grows away from the eye; needed unless blend="order" without
+                        depth. Copied if its rows lie differently from those of rgba, else read in place
         order           this rank's place, 0 in front, a different one on each rank: needed with blend="order" and
-                        rgba, else ignored
+                        rgba, else ignored. place() finds it
         bottom_up       the first row is the lowest, as OpenGL has it
-        origin          (x, y): where the first pixel is in the picture, if rgba is a part of it; y counts from the first row
+        origin          (x, y): where the first pixel is in the picture, if rgba is a part of it; y counts from the
+                        first row
         far_depth       a pixel at this depth or beyond is empty; 1 in OpenGL. None: infinity
         straight_alpha  colours are not multiplied by alpha yet
         bgra            blue comes first
@@ -241,6 +242,17 @@ class ImageCompositor(_Collective):
         return self._impl.composite(rgba, depth, {"order": order, "bottom_up": bottom_up, "origin": origin,
                                                   "far_depth": far_depth, "straight_alpha": straight_alpha,
                                                   "bgra": bgra})
+
+    def place(self, lower, upper, eye):
+        """Return this rank's place from front to back, for the `order` of composite().
+
+        lower, upper  corners of the box that holds this rank's data
+        eye           where the camera is, the same on all ranks
+
+        Collective. Raises Error on all ranks if boxes overlap, or if there is no order: three boxes can each be in front
+        of the next.
+        """
+        return self._impl.place(lower, upper, eye)
 
 
 class Brick:
@@ -266,9 +278,9 @@ class FrameBuffer(_Collective):
 
     blend  "alpha": inputs blended front to back by depth, pixel by pixel; "nearest": the one with the least depth; or a
            function of yours, for prototypes: function(inputs) returns rgba, or (rgba, depth). inputs is a list of
-           Input, those that have pixels in a tile, by source. It returns arrays (height, width, 4), premultiplied and linear,
-           and (height, width). The background comes behind it. It is called on the rank that owns the tile, for one tile
-           at a time. All ranks must give the same one, which cannot be checked.
+           Input, those that have pixels in a tile, by source. It returns arrays (height, width, 4), premultiplied and
+           linear, and (height, width). The background comes behind it. It is called on the rank that owns the tile,
+           for one tile at a time. All ranks must give the same one, which cannot be checked.
 
     The other arguments are those of ImageCompositor. Collective. Raises Error on all ranks.
     """
