@@ -10,7 +10,7 @@
 DFB_NAMESPACE_BEGIN
 
 // A set of channels, one bit each. Unless a tile operation says otherwise, the inputs of a pixel are blended front to
-// back, channel by channel as said here. With several passes each is blended first, then the passes are averaged.
+// back, channel by channel as said here. With several passes each is blended first, then colours are averaged.
 //
 // A pixel of an input is active if its colour or alpha is not 0. Only active pixels count, whatever the other channels
 // hold. A pixel with colour but alpha 0 is emission: its colour is added; it hides nothing, and gives no depth,
@@ -20,8 +20,8 @@ DFB_NAMESPACE_BEGIN
 // +infinity. With DepthComposite it then gives depth, position and ids whatever its colour and alpha.
 using ChannelMask = std::uint16_t;
 inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats: blended by the operator over
-// 1 float: the distance along the ray, or any function that grows with it. The image gets the nearest of the inputs
-// with alpha > 0.
+// 1 float: the distance along the ray, or any function that grows with it. The image gets the nearest of the inputs of
+// all passes with alpha > 0.
 inline constexpr ChannelMask depthChannel = 2;
 // Auxiliary channels. Normals and albedo are blended, so they are premultiplied by the pixel's alpha, as colour is. The
 // image gets their mean weighted by alpha, without the background, and 0 where alpha is 0.

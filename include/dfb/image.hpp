@@ -249,7 +249,9 @@ double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int
 DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image)
 {
     if (image.empty())
-        detail::failArgument("no image to write to %s: only the display rank has one", path.c_str());
+        detail::failArgument("no image to write to %s: only the display rank has one, if the last frame did not fail "
+                             "and the format is not None",
+                             path.c_str());
     const auto width = static_cast<std::size_t>(image.width()), height = static_cast<std::size_t>(image.height());
     const bool isFloat = image.format() == OutputFormat::RGBA32F;
     std::vector<std::uint8_t> converted(isFloat ? 4 * width : 0), row(3 * width);

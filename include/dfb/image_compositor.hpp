@@ -521,8 +521,9 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place)
     if (image.rgba8 && image.rgba32f)
         detail::failArgument("an image of 8 bits and of floats");
     if (isThere && blend_ == ImageBlend::InOrder && (place < 0 || place >= size()))
-        detail::failArgument("place %d in an order of %d ranks: each rank gives its own, from 0, in front, to %d",
-                             place, size(), size() - 1);
+        detail::failArgument(
+            "place %d in an order of %d ranks: each rank gives its own to composite(), from 0, in front, to %d", place,
+            size(), size() - 1);
     const detail::InputTile part(image, region, layout, image.bottomUp != bottomUp_, usesDepth);
     const auto source = static_cast<std::uint32_t>(blend_ == ImageBlend::InOrder ? place : rank());
     inputs_.clear();

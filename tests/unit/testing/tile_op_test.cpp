@@ -6,6 +6,8 @@
 #include <dfb/testing/tile_op_test.hpp>
 
 #include <algorithm>
+#include <cstddef>
+#include <limits>
 #include <memory>
 #include <set>
 #include <string>
@@ -79,6 +81,33 @@ private:
     std::vector<double> background_;
 };
 
+// The nearest input of a pixel; of equally near ones the first that came.
+struct EqualDepthsAsTheyCame {
+    static constexpr int tileSize = 16;
+    static constexpr dfb::ChannelMask channels = dfb::colorChannel | dfb::depthChannel;
+
+    void newFrame(const dfb::TileInfo& info)
+    {
+        images_.newFrame(info);
+        nearest_.assign(images_.count(), std::numeric_limits<float>::infinity());
+    }
+    void add(dfb::Fragment&& fragment)
+    {
+        fragment.forEachPixel([&](int x, int y, const float* rgba, float depth) {
+            const std::size_t pixel = images_.index(fragment.header().pass, x, y);
+            if (depth < nearest_[pixel]) {
+                nearest_[pixel] = depth;
+                std::copy_n(rgba, 4, images_.pixel(pixel));
+            }
+        });
+    }
+    void finish(dfb::FinishedTile& out) { images_.finish(out); }
+
+private:
+    dfb::PassImages images_;
+    std::vector<float> nearest_;
+};
+
 struct WithFrameData : Strongest<Fault::None> {
     struct FrameData {};
     void newFrame(const dfb::TileInfo& info, const FrameData&) { Strongest::newFrame(info); }
@@ -111,6 +140,7 @@ TEST_CASE("checkTileOp() finds what a bad operation does wrong", "[tile_op_test]
     CHECK(finds<Fault::OldState>("the frame before"));
     CHECK(finds<Fault::OtherMean>("not the mean"));
     CHECK(finds<Fault::NoBackground>("the background does not show"));
+    CHECK(checkTileOp<EqualDepthsAsTheyCame>(2).find("order in which inputs come") != std::string::npos);
     CHECK(checkTileOp<MissesRow>().find("Not each pixel") != std::string::npos);
 }
 

@@ -203,10 +203,11 @@ ErrorReport compare(const TileInputs<tileSizeOf<Op>>& in, const std::vector<Pixe
 // Checks an operation of your own against the contract in tile_op.hpp, in one line: REQUIRE(checkTileOp<MyOp>() == "").
 // Returns a sentence for each fault, or nothing. The image must not depend on the order in which inputs come, nor on
 // the frame before. Each pixel must be set. An image of two passes must be the mean of the images of each. Empty inputs
-// must show the background. Inputs are random, half transparent, and have a depth, but no other channel. `label(header,
+// must show the background. Inputs are random, half transparent, and have a depth, but no other channel; in half of
+// the rounds many depths are equal. `label(header,
 // layer)` may set the generation and source that the operation expects; without it they are generation 1 and source
 // `layer`. For operations that keep no state.
-template <class Op, class Label>
+template <class Op, class Label, std::enable_if_t<std::is_invocable_v<const Label&, TileHeader&, int>, int> = 0>
 std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
 {
     static_assert((Op::channels & ~(colorChannel | depthChannel)) == 0, "its inputs have colour and depth only");
@@ -214,6 +215,7 @@ std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
     constexpr int size = tileSizeOf<Op>, layers = 3;
     std::mt19937_64 random(seed);
     const auto number = [&] { return static_cast<float>(random() >> 40) * 0x1p-24f; };
+    bool hasFewDepths = false; // so that many are equal
     // Makes inputs of `passes` passes, for an image `width` pixels wide.
     const auto make = [&](int passes, int width, bool isEmpty) {
         Inputs in;
@@ -233,7 +235,7 @@ std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
                         rgba[3] = 0.1f + 0.8f * number();
                         for (int c = 0; c < 3; ++c)
                             rgba[c] = rgba[3] * number();
-                        tile.depth[y * size + x] = 1 + number();
+                        tile.depth[y * size + x] = 1 + (hasFewDepths ? static_cast<float>(random() % 2) : number());
                     }
             }
         return in;
@@ -256,6 +258,7 @@ std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
     };
     bool hasOrder = false, hasMemory = false, hasHoles = false, hasOtherMean = false, hasOtherBackground = false;
     for (int round = 0; round < 20; ++round) {
+        hasFewDepths = round % 2 == 1;
         Inputs in = make(2, size - round % 3, false);
         const TileOutput expected = run(in, in.order());
         auto order = in.order();
