@@ -19,7 +19,7 @@ while [ $# -gt 0 ]; do
         frames=5 compositing_frames=3 views=4 skip_size=1024x1024 paper_views=3 paper_sizes=256x256 quick=--quick
         ;;
     --launcher)
-        launcher=$2
+        launcher=${2:?"a launcher is missing: sh bench/run.sh [--quick] [--launcher CMD]"}
         shift
         ;;
     *)

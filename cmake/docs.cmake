@@ -22,6 +22,9 @@ foreach(example IN LISTS examples)
 endforeach()
 file(WRITE ${DFB_SITE}/examples.dox "${pages}")
 
+if(NOT EXISTS ${PROJECT_SOURCE_DIR}/docs/site/Doxyfile.in) # only a part of the sources
+  return()
+endif()
 configure_file(${PROJECT_SOURCE_DIR}/docs/site/Doxyfile.in ${DFB_SITE}/Doxyfile @ONLY)
 add_custom_target(docs
   COMMAND ${CMAKE_COMMAND} -E remove_directory ${DFB_SITE}/html

@@ -12,13 +12,22 @@ set -u
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root" || exit 1
-sh cmake/install_packages.sh clang || exit 1
 
 brief=no
 if [ "${1:-}" = --brief ]; then
     brief=yes
     shift
 fi
+for preset in "$@"; do
+    case $preset in
+    asan | tsan | clang) ;;
+    *)
+        echo "usage: sh tests/sanitizers.sh [--brief] [asan] [tsan] [clang]" >&2
+        exit 2
+        ;;
+    esac
+done
+sh cmake/install_packages.sh clang || exit 1
 jobs=$(sh cmake/jobs.sh)
 [ $# -gt 0 ] || set -- asan tsan clang
 

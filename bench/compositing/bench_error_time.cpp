@@ -1,8 +1,8 @@
 // Time against error: what every way to send tiles costs and how exact its image is; beside IceT with floats and bytes,
 // and a plain loop in float, on the same partial images in the same run, frame by frame in turn. And what samples cost
 // in a scene with noise.
-//   mpirun -n 4 bench_error_time [--size 1024x1024] [--frames 21] [--json FILE] [--table FILE] [--commit
-//   ID] [--trace FILE]
+//   mpirun -n 4 bench_error_time [--size 1024x1024] [--frames 21] [--only TEXT] [--json FILE] [--table FILE]
+//   [--commit ID] [--trace FILE]
 // --trace: of dfb's first system.
 #include "systems.hpp"
 

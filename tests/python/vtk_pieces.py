@@ -1,6 +1,6 @@
 """VTK renders a slab of a data set on each rank; the picture of all is that of VTK alone, bit for bit.
 
-    mpirun -n 4 python3 -m mpi4py vtk_pieces.py [picture.png]
+    mpirun -n 4 python3 -m mpi4py vtk_pieces.py [picture.ppm]
 """
 import sys
 
