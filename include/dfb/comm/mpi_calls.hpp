@@ -58,13 +58,14 @@ inline void requireMpiOfHeaders()
     char text[16384] = ""; // MPI_MAX_LIBRARY_VERSION_STRING of the other MPI may be larger than that of this one
     int length = 0;
     MPI_Get_library_version(text, &length);
-    const auto says = [&text](const char* name) { return std::strstr(text, name) != nullptr; };
+    // Only how it begins: a library that translates between MPIs names them after itself.
+    const bool isOpenMpi = std::strncmp(text, "Open MPI", 8) == 0;
 #if defined(OPEN_MPI)
     const char* const compiledFor = "Open MPI";
-    const bool isOther = !says("Open MPI") && (says("MPICH") || says("Intel(R) MPI"));
+    const bool isOther = !isOpenMpi && (std::strstr(text, "MPICH") || std::strstr(text, "Intel(R) MPI"));
 #else
     const char* const compiledFor = "MPICH or a relative of it";
-    const bool isOther = says("Open MPI");
+    const bool isOther = isOpenMpi;
 #endif
     if (isOther)
         throw TransportError(printed("dfb was compiled for %s, but the MPI of this process is %.*s: compile dfb for it",
