@@ -502,7 +502,10 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place)
 {
     const TileLayout& layout = engine_->layout();
     const Region region = image.region == Region{} ? Region{0, 0, layout.width(), layout.height()} : image.region;
-    if (region.x1 < region.x0 || region.y1 < region.y0)
+    const auto isRange = [](int begin, int end) {
+        return begin <= end && end <= std::int64_t{begin} + std::numeric_limits<int>::max();
+    };
+    if (!isRange(region.x0, region.x1) || !isRange(region.y0, region.y1))
         detail::failArgument("an image of columns %d to %d and rows %d to %d", region.x0, region.x1, region.y0,
                              region.y1);
     if (image.depth && !image.rgba8 && !image.rgba32f && !region.empty())

@@ -114,6 +114,8 @@ program test_module
   whole%id = merge(100 + rank, rank, rank == ranks - 1)
   status = dfb_render(fb, [whole], view, projection, fill, c_loc(handed))
   call expect(status == DFB_FRAME_FAILED .and. index(dfb_last_error(), 'returned 5') > 0, 'a renderer that fails')
+  status = dfb_composite(fb, place=0)
+  call expect(status == DFB_FRAME_FAILED .and. index(dfb_last_error(), 'a null dfb_input') > 0, 'no input')
   call dfb_destroy(fb)
 
   ! Bytes in an order of the ranks: the last is in front.

@@ -11,6 +11,7 @@
 
 #include <dfb.h>
 
+#include <limits.h>
 #include <pthread.h>
 #include <signal.h>
 #include <stdio.h>
@@ -215,6 +216,8 @@ static int draw_and_call(const dfb_brick* brick, const dfb_tile* tile, void* use
     MPI_Is_thread_main(&is_main);
     expect(is_main, "the renderer is called by another thread");
     expect(dfb_resize(called, 10, 10) == DFB_INVALID_ARGUMENT, "dfb_resize() by a renderer");
+    dfb_destroy(called);
+    expect_error(DFB_OK, DFB_OK, "a renderer cannot destroy it", "", "dfb_destroy() by a renderer");
     expect(!dfb_image_rgba8(called), "no picture while one is made");
     return draw(brick, tile, user);
 }
@@ -347,7 +350,7 @@ static void check_composite(dfb_framebuffer* fb)
     const int bad = ranks - 1;
     char name[20];
     snprintf(name, sizeof name, "rank %d", bad);
-    for (int wrong = 0; wrong < 4; ++wrong) {
+    for (int wrong = 0; wrong < 5; ++wrong) {
         dfb_input input;
         const dfb_input* given = &input;
         const char* text = "";
@@ -363,6 +366,9 @@ static void check_composite(dfb_framebuffer* fb)
             input.struct_size += rank == bad, text = "a dfb_input of";
         if (wrong == 3)
             input.rgba32f = rank == bad ? floats : NULL, text = "an image of 8 bits and of floats";
+        if (wrong == 4)
+            input.region[0] = rank == bad ? INT_MIN : 0, input.region[2] = rank == bad ? INT_MAX : 0,
+            text = "an image of columns -2147483648 to 2147483647";
         expect_error(dfb_composite(fb, given, 0), DFB_FRAME_FAILED, text, name, "dfb_composite");
         expect_picture(fb);
     }
@@ -563,6 +569,18 @@ int main(int argc, char** argv)
     else
         check_errors();
     MPI_Allreduce(&failures, &all_failures, 1, MPI_INT, MPI_SUM, MPI_COMM_WORLD);
+    if (level == MPI_THREAD_SINGLE) { /* so no thread of the library calls MPI */
+        dfb_config config;
+        dfb_config_init(&config, 10, 10);
+        require(dfb_create(MPI_COMM_SELF, &config, &fb), "dfb_create");
+    }
     MPI_Finalize();
+    if (fb) {
+        dfb_input input;
+        dfb_input_init(&input);
+        if (dfb_composite(fb, &input, 0) != DFB_TRANSPORT_FAILED || !strstr(dfb_last_error(), "MPI has been finalised"))
+            fprintf(stderr, "dfb_composite() after MPI_Finalize(): %s\n", dfb_last_error()), all_failures = 1;
+        dfb_destroy(fb);
+    }
     return all_failures > 0;
 }

@@ -86,7 +86,7 @@ module dfb
     function dfb_composite(framebuffer, input, place) bind(c, name='dfb_composite') result(status)
       import :: dfb_input, c_ptr, c_int
       type(c_ptr), value :: framebuffer
-      type(dfb_input), intent(in) :: input
+      type(dfb_input), intent(in), optional :: input ! without one: this rank could not make its image
       integer(c_int), value :: place
       integer(c_int) :: status
     end function

@@ -86,8 +86,8 @@ int dfb_create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer*
 // For a Fortran handle: the one of `use mpi`, or the mpi_val of a communicator of `use mpi_f08`. Otherwise as above.
 int dfb_create_fortran(MPI_Fint communicator, const dfb_config* config, dfb_framebuffer** framebuffer);
 
-// Destroys a framebuffer; call it before MPI_Finalize(). Pointers to its picture become invalid. Null is ignored.
-// Collective; waits for all ranks.
+// Destroys a framebuffer; call it before MPI_Finalize(). Pointers to its picture become invalid. Null is ignored, and
+// so is a call from a renderer of this framebuffer. Collective; waits for all ranks.
 void dfb_destroy(dfb_framebuffer* framebuffer);
 
 // Changes the size of the picture, which is empty then. Collective; waits for all ranks. DFB_INVALID_ARGUMENT on all
@@ -158,7 +158,8 @@ typedef struct dfb_tile {
 // Fills those pixels of the tile whose rays meet the brick, as far as they are within its box. `brick` is the element
 // of the array that dfb_render() got. Returns 0, or another number if it failed: the picture fails on all ranks then,
 // with the brick and the number in the error. The thread that is in dfb_render() calls it; if dfb_config::threads is
-// not 1, several other threads call it at once. It must not call functions on the framebuffer.
+// not 1, several other threads call it at once. It must not call functions on the framebuffer, nor functions of MPI that wait for
+// other ranks.
 typedef int (*dfb_render_brick)(const dfb_brick* brick, const dfb_tile* tile, void* user);
 
 // Makes one picture of the bricks of all ranks. Calls render_brick(brick, tile, user) for each of this rank's `count`

@@ -233,6 +233,15 @@ struct dfb_framebuffer {
 
 namespace {
 
+// Throws TransportError if MPI has been finalised: it ends a process that calls it then.
+void requireMpi()
+{
+    int isFinalized = 0;
+    MPI_Finalized(&isFinalized);
+    if (isFinalized)
+        throw dfb::TransportError("MPI has been finalised");
+}
+
 // Calls body(framebuffer). It is an error if the framebuffer is in another call, as when a renderer calls a function on
 // it.
 template <class Body>
@@ -241,6 +250,7 @@ int inFramebuffer(dfb_framebuffer* framebuffer, const Body& body) noexcept
     return guarded([&] {
         if (!framebuffer)
             refuse("a null dfb_framebuffer");
+        requireMpi();
         if (framebuffer->isBusy)
             refuse("this framebuffer is in another call: a renderer cannot call functions on it");
         framebuffer->isBusy = true;
@@ -330,7 +340,13 @@ int dfb_create_fortran(MPI_Fint communicator, const dfb_config* config, dfb_fram
     return dfb_create(isInitialized ? MPI_Comm_f2c(communicator) : MPI_COMM_WORLD, config, framebuffer);
 }
 
-void dfb_destroy(dfb_framebuffer* framebuffer) { delete framebuffer; }
+void dfb_destroy(dfb_framebuffer* framebuffer)
+{
+    if (framebuffer && framebuffer->isBusy)
+        failed(DFB_INVALID_ARGUMENT, "this framebuffer is in another call: a renderer cannot destroy it");
+    else
+        delete framebuffer;
+}
 
 int dfb_resize(dfb_framebuffer* framebuffer, int width, int height)
 {

@@ -515,8 +515,11 @@ private:
         ByteReader in(all);
         const auto first = in.get<std::int32_t>();
         std::string call = in.getText();
-        if (first < 0)
+        if (first < 0) {
+            connection_
+                ->throwIfFailed(); // a rank that waited too long makes another call than the others, from then on
             throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, std::move(call)), connection_->throwByAll());
+        }
         read(in);
         in.end();
     }
