@@ -148,7 +148,7 @@ class Errors(unittest.TestCase):
             (dict(rgba=rgba.astype(">f4"), depth=depth), "it must be .* of uint8 or float32"),
             (dict(rgba=rgba[1:], depth=depth[1:]), "rgba has 150x92 pixels, the picture 150x93: give origin"),
             (dict(rgba=read_in_columns, depth=depth), "numpy.ascontiguousarray.rgba."),
-            (dict(rgba=np.broadcast_to(rgba[:1], rgba.shape), depth=depth), "numpy.ascontiguousarray.rgba."),
+            (dict(rgba=np.broadcast_to(rgba[:1], rgba.shape), depth=depth), "the rows of rgba overlap"),
             (dict(rgba=rgba, depth=depth.astype(float)), "depth is .*float64"),
             (dict(rgba=rgba, depth=depth[1:]), r"depth is \(92, 150\)"),
             (dict(rgba=rgba, depth=depth.T), r"depth is \(150, 93\)"),
@@ -204,6 +204,7 @@ class Errors(unittest.TestCase):
         errors = errors_of(compositor, lambda thing, rank: thing.fail(OSError("disk is gone")) if rank == 2
                            else thing.composite(rgba, depth))
         self.assertEqual({(e.message, e.rank) for e in errors}, {("OSError: disk is gone", 2)})
+        self.assertEqual([type(e.__cause__) for e in errors].count(OSError), 1)
         errors = errors_of(framebuffer, lambda thing, rank: thing.fail("no data") if rank == 2
                            else thing.render([brick(rank)], CAMERA, fill))
         self.assertEqual({(e.message, e.rank) for e in errors}, {("no data", 2)})

@@ -36,9 +36,11 @@ struct ArrayRows {
         };
         const py::ssize_t stride = height > 1 ? array.strides(0) : width * pixel;
         const bool isInRows = isDense(1, pixel) && (channels == 1 || isDense(2, array.itemsize()));
-        if (!isInRows || stride % pixel != 0 || std::abs(stride) < width * pixel)
-            throw dfb::InvalidArgument("the pixels of a row of " + name
-                                       + " do not lie one after another: give numpy.ascontiguousarray(" + name + ")");
+        const bool areApart = stride % pixel == 0 && std::abs(stride) >= width * pixel;
+        if (!isInRows || !areApart)
+            throw dfb::InvalidArgument((isInRows ? "the rows of " + name + " overlap"
+                                                 : "the pixels of a row of " + name + " do not lie one after another")
+                                       + ": give numpy.ascontiguousarray(" + name + ")");
         isFlipped = stride < 0;
         first = static_cast<const std::byte*>(array.data()) + (isFlipped ? (height - 1) * stride : 0);
         if (reinterpret_cast<std::uintptr_t>(first) % static_cast<std::uintptr_t>(array.itemsize()) != 0)

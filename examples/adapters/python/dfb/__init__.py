@@ -155,10 +155,13 @@ class _Collective:
 
         why is an exception or a text. Collective with the calls of the other ranks.
         """
-        if isinstance(why, BaseException):
+        cause = why if isinstance(why, BaseException) else None
+        if cause:
             why = f"{type(why).__name__}: {why}"
-        # The name of a file may have characters that cannot be encoded.
-        self._impl.fail(str(why).encode(errors="backslashreplace").decode())
+        try:  # the name of a file may have characters that cannot be encoded
+            self._impl.fail(str(why).encode(errors="backslashreplace").decode())
+        except Error as error:
+            raise error from cause
 
     def resize(self, width, height):
         """Change the size of the picture. image is None then.
