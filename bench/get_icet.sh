@@ -39,7 +39,10 @@ if [ -z "$header" ] || [ -z "$library" ]; then
 fi
 
 mkdir -p "$new/include" "$new/lib"
-cp "$(dirname "$header")/IceT.h" "$(find "$work/files" -name IceTConfig.h | head -n 1)" "$new/include"
+cp "$(dirname "$header")/IceT.h" "$new/include"
+for name in IceTConfig.h IceTMPI.h; do # the library needs the first, its users both
+    cp "$(find "$work/files" -name $name | head -n 1)" "$new/include"
+done
 cp -P "$library"* "$new/lib"
 mv -T "$new" "$dir" || [ -e "$dir/include/IceT.h" ] # of another run
 echo "get_icet.sh: IceT is in $dir" >&2

@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <cstdio>
 #include <cstdlib>
 #include <numeric>
 
@@ -120,7 +121,8 @@ std::vector<int> gatherColors(const IceTContextStruct& context, int color)
     for (int isDone = 0; MPI_Test(&request, &isDone, MPI_STATUS_IGNORE), !isDone; sched_yield())
         if (timeLimit().count() > 0 && secondsNow() > limit) {
             gather.release(); // MPI may still write there
-            throw Error(ICET_INVALID_OPERATION, "not all ranks call it");
+            throw Error(ICET_INVALID_OPERATION, "some ranks have not come here: they have left out this call, or only "
+                                                "some ranks have changed tiles, formats or mode");
         }
     return gather->all;
 }
@@ -140,7 +142,14 @@ std::chrono::milliseconds timeLimit()
 {
     static const double seconds = [] {
         const char* value = std::getenv("DFB_ICET_TIMEOUT");
-        return value ? std::clamp(std::atof(value), 0.0, 1e6) : 600.0;
+        char* end = nullptr;
+        const double given = value ? std::strtod(value, &end) : 600.0;
+        if (value && (end == value || *end != '\0' || !(given >= 0))) {
+            std::fprintf(stderr, "dfb: DFB_ICET_TIMEOUT is '%s', which is no number of seconds; it is 600 now\n",
+                         value);
+            return 600.0;
+        }
+        return std::min(given, 1e6);
     }();
     return std::chrono::milliseconds(static_cast<std::int64_t>(1000 * seconds));
 }
