@@ -1,7 +1,7 @@
 // A program that has initialised MPI at any thread level gets its images with default settings. On each rank a progress
 // thread moves messages or, below MPI_THREAD_MULTIPLE, the caller does, and then no other thread calls MPI. Also tests
-// the errors of the constructor if Progress::Thread is not possible, and if MPI is not initialised, or not the one of the
-// headers. MPI can be initialised only once in a process:
+// the errors of the constructor if Progress::Thread is not possible, and if MPI is not initialised, or not the one of
+// the headers. MPI can be initialised only once in a process:
 //   mpirun -n 2 mpi_level mixed      rank 0 with MPI_Init, the others at MPI_THREAD_MULTIPLE
 // Returns 0 if all is well.
 #include <dfb/dfb.hpp>
@@ -41,6 +41,19 @@ std::thread::id mainThread;
 std::atomic<int> callsElsewhere{0}; // of MPI, by other threads than that
 
 std::atomic<int> sends{0};
+
+std::atomic<int> callsNow{0}, overlaps{0}; // of sending and testing
+std::atomic<bool> areSlow{false};          // so that overlaps are likely
+
+struct Call {
+    Call()
+    {
+        overlaps += callsNow++ > 0;
+        if (areSlow)
+            std::this_thread::sleep_for(std::chrono::microseconds(30));
+    }
+    ~Call() { --callsNow; }
+};
 
 bool isOtherMpi = false; // then MPI calls itself by another name
 
@@ -240,6 +253,35 @@ void whileWorkersRender()
         checkImage(fb.image(), fb.layout(), 1, "while workers rendered");
 }
 
+// Workers give tiles to two framebuffers, each with a connection of its own.
+void twoConnections()
+{
+    auto config = smallConfig();
+    config.image.width = config.image.height = 256;
+    FrameBuffer left(MPI_COMM_WORLD, config), right(MPI_COMM_WORLD, config);
+    std::vector<int> mine;
+    for (int tile = left.rank(); tile < left.layout().tileCount(); tile += left.size())
+        mine.push_back(tile);
+    areSlow = true;
+    for (int number = 0; number < 5; ++number) {
+        auto one = left.begin(), two = right.begin();
+        one.forEachTile(mine, [&](auto& tile) {
+            tile.fill({0, greenOf(1) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
+            one.setTile(tile);
+            const auto other = std::make_unique<FrameBuffer::Tile>();
+            two.start(*other, tile.tile, 0);
+            other->fill({0, greenOf(1) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
+            two.setTile(*other);
+        });
+        one.end();
+        two.end();
+    }
+    areSlow = false;
+    if (left.isDisplayRank())
+        for (const FrameBuffer* fb : {&left, &right})
+            checkImage(fb->image(), fb->layout(), 1, "two connections");
+}
+
 } // namespace
 
 // In place of MPI's own: all that the library does once it is there.
@@ -248,6 +290,7 @@ extern "C" {
 int MPI_Isend(const void* data, int count, MPI_Datatype type, int to, int tag, MPI_Comm comm, MPI_Request* request)
 {
     noteCall();
+    const Call call;
     ++sends;
     return PMPI_Isend(data, count, type, to, tag, comm, request);
 }
@@ -261,6 +304,7 @@ int MPI_Irecv(void* data, int count, MPI_Datatype type, int from, int tag, MPI_C
 int MPI_Testsome(int count, MPI_Request requests[], int* done, int indices[], MPI_Status statuses[])
 {
     noteCall();
+    const Call call;
     return PMPI_Testsome(count, requests, done, indices, statuses);
 }
 
@@ -337,6 +381,9 @@ int main(int argc, char** argv)
         wallAndSharedWorld();
         smallPool();
         whileWorkersRender();
+        overlaps = 0;
+        twoConnections();
+        check(level == MPI_THREAD_MULTIPLE || overlaps == 0, "calls of MPI at once", std::to_string(overlaps));
         if (!isMixed && level < MPI_THREAD_SERIALIZED)
             otherThread();
     } catch (const std::exception& e) {

@@ -155,6 +155,11 @@ public:
     // error. Afterwards nothing is sent but that, and nothing received.
     bool poll()
     {
+        // At MPI_THREAD_SERIALIZED threads of several connections come here, each with another lock.
+        static std::mutex onlyOne;
+        std::unique_lock<std::mutex> lock(onlyOne, std::defer_lock);
+        if (isSerialized_ && !lock.try_lock())
+            return false;
         if (failed_)
             finishNotices();
         return !failed_ && guarded([this] { return move(); });
@@ -202,6 +207,7 @@ private:
     void prepare(Progress progress)
     {
         const int level = detail::mpiLevel();
+        isSerialized_ = level == MPI_THREAD_SERIALIZED;
         if (level < MPI_THREAD_MULTIPLE && progress == Progress::Thread)
             throw TransportError(
                 detail::printed("MPI was initialised at thread level %s, Progress::Thread needs MPI_THREAD_MULTIPLE: "
@@ -683,6 +689,7 @@ private:
     }
 
     const std::thread::id onlyThread_; // the only one that may call MPI; none if all may
+    bool isSerialized_ = false;        // all may, but one at a time
     detail::NoFinalize noFinalize_;
     std::shared_ptr<MemoryPool> pool_;
     detail::MpiRanks ranks_;
