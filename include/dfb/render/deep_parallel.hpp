@@ -36,8 +36,8 @@ struct Segment {
 // it by the largest c' / a'.
 class DeepTile {
 public:
-    // `maxSegments`: segments a pixel, 1 to 65535. Less counts as 1, more as 65535. One thread at a time may use the
-    // tile.
+    // `maxSegments`: segments a pixel, 1 to 65535. Less counts as 1, more as 65535. Each pixel has room for the most
+    // that one has had. One thread at a time may use the tile.
     explicit DeepTile(int maxSegments) : maxSegments_(std::clamp(maxSegments, 1, 65535)) {}
 
     int maxSegments() const noexcept { return maxSegments_; }
@@ -50,7 +50,7 @@ public:
             static_cast<std::size_t>(header.region.width()) * static_cast<std::size_t>(header.region.height());
         counts_.assign(pixels, 0);
         errors_.assign(pixels, 0.0);
-        segments_.resize(pixels * static_cast<std::size_t>(maxSegments_));
+        segments_.resize(pixels * room_);
         layers_ = 0;
         errorBound_ = 0;
     }
@@ -64,8 +64,10 @@ public:
         if (segment.rgba == std::array<float, 4>{})
             return;
         const std::size_t pixel = pixelAt(x - header_.region.x0, y - header_.region.y0);
-        Segment* first = segments_.data() + pixel * static_cast<std::size_t>(maxSegments_);
         std::uint16_t& count = counts_[pixel];
+        if (count == room_ && count < maxSegments_)
+            makeRoom();
+        Segment* first = segments_.data() + pixel * room_;
         if (count == maxSegments_) {
             std::vector<Segment>& all = scratch_;
             all.assign(first, first + count);
@@ -99,8 +101,7 @@ public:
                 const std::size_t pixel = pixelAt(x, y);
                 if (layer >= counts_[pixel])
                     continue;
-                const Segment& s =
-                    segments_[pixel * static_cast<std::size_t>(maxSegments_) + static_cast<std::size_t>(layer)];
+                const Segment& s = segments_[pixel * room_ + static_cast<std::size_t>(layer)];
                 std::copy(s.rgba.begin(), s.rgba.end(), tile.pixel(x, y));
                 tile.depth[y * TileType::size + x] = s.depth;
                 tile.farDepth[y * TileType::size + x] = s.farDepth;
@@ -109,6 +110,18 @@ public:
 
 private:
     static bool nearer(const Segment& a, const Segment& b) { return a.depth < b.depth; }
+
+    // Doubles the room of each pixel.
+    void makeRoom()
+    {
+        const std::size_t room = std::min(2 * room_, static_cast<std::size_t>(maxSegments_));
+        std::vector<Segment> wider(counts_.size() * room);
+        for (std::size_t pixel = 0; pixel < counts_.size(); ++pixel)
+            std::copy_n(segments_.begin() + static_cast<std::ptrdiff_t>(pixel * room_), counts_[pixel],
+                        wider.begin() + static_cast<std::ptrdiff_t>(pixel * room));
+        segments_ = std::move(wider);
+        room_ = room;
+    }
 
     // Merges the two neighbours whose merge may change the pixel least, and returns by how much.
     static double mergeCheapest(std::vector<Segment>& all)
@@ -121,7 +134,7 @@ private:
             for (const float v : behind)
                 largest = std::max(largest, std::fabs(v));
             through *= 1 - static_cast<double>(all[i].rgba[3]);
-            const double cost = through * static_cast<double>(largest);
+            const double cost = std::fabs(through) * static_cast<double>(largest); // alpha may be above 1
             if (i == 0 || cost < bestCost) {
                 best = i;
                 bestCost = cost;
@@ -143,7 +156,8 @@ private:
     TileHeader header_;
     std::vector<std::uint16_t> counts_; // per pixel
     std::vector<double> errors_;        // per pixel
-    std::vector<Segment> segments_;     // maxSegments_ per pixel, the first counts_ of which are used, front to back
+    std::size_t room_ = 1;              // of each pixel, in segments; at most maxSegments_
+    std::vector<Segment> segments_;     // room_ per pixel, the first counts_ of which are used, front to back
     std::vector<Segment> scratch_;
     int layers_ = 0;
     double errorBound_ = 0;

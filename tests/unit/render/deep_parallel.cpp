@@ -23,3 +23,17 @@ TEST_CASE("A deep tile keeps 1 to 65535 segments a pixel")
     deep.writeLayer(0, *front);
     CHECK(front->depth[0] == 0);
 }
+
+TEST_CASE("The error bound of a deep tile holds for alpha above 1")
+{
+    for (const float alpha : {0.5f, 1.5f, 3.0f}) {
+        dfb::DeepTile deep(2);
+        dfb::TileHeader header;
+        header.region = {0, 0, 1, 1};
+        deep.reset(header);
+        deep.add(0, 0, {{alpha, 0, 0, alpha}, 0, 0.5f});
+        deep.add(0, 0, {{0, 0.25f, 0, 0.25f}, 1, 1.5f});
+        deep.add(0, 0, {{0, 0, 0.5f, 0.5f}, 3, 3.5f});
+        CHECK(deep.errorBound() > 0);
+    }
+}
