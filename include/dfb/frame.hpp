@@ -69,10 +69,11 @@ struct FrameBufferConfig {
     std::shared_ptr<Executor> executor{};
     // onTile(tile index, its pixels, image), for windows that show a frame while it is made. Called on the display rank
     // for each composited tile, when its pixels are in the image of the open frame. A tile without active pixels is
-    // left out if the operation is one of the library's (not Progressive) and the pixel operation is pointwise. Worker
-    // threads call it, and your own threads in setTile(), poll(), loops and calls that wait, such as end(); for several
-    // tiles at once, while other pixels of the image are still being written. It must be quick. An exception makes the
-    // frame fail. For tiles whose owners are on the display rank's node, all calls may come at the end of the frame.
+    // left out if the operation is one of the library's (not Progressive), the pixel operation is pointwise, and its
+    // inputs are not read in place. Worker threads call it, and your own threads in setTile(), poll(), loops and calls
+    // that wait, such as end(); for several tiles at once, while other pixels of the image are still being written. It
+    // must be quick. An exception makes the frame fail. For tiles whose owners are on the display rank's node, all
+    // calls may come at the end of the frame.
     TileCallback onTile{};
     // After this time in end(), ranks check whether a message is still under way; they check again at growing
     // intervals. If no message is, the frame fails with ErrorKind::MissingInput. 1 ms to 24 days. A short time costs a
