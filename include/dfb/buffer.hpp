@@ -171,6 +171,9 @@ public:
         return buffer.block_.release();
     }
 
+    // Empties `buffer`, whose block in shared memory is never used again: another process may write there at any time.
+    static void retire(Buffer& buffer) noexcept { buffer.block_.release(); }
+
 private:
     static constexpr std::size_t alignment = 64;
     static constexpr std::size_t smallest = 256;

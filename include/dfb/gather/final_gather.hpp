@@ -68,6 +68,13 @@ public:
                 spareBatches_.push_back(std::make_shared<Batch>());
     }
 
+    // After a failed frame, a task of another rank may still look at the gate.
+    ~FinalGather()
+    {
+        if (imageGate_)
+            MemoryPool::retire(gateMemory_);
+    }
+
     // The image is valid only while imageFrame() >= 0; then imageFrame() is the frame that it shows.
     const Image& image() const noexcept { return image_; }
     std::int64_t imageFrame() const noexcept { return imageFrame_; }
@@ -184,7 +191,7 @@ public:
                 std::memcpy(to.at[c], from.at[c], copy.pixelCount() * record_.pixelBytes(c));
         for (Buffer& plane : image_.release())
             pool_->lend(plane);
-        pool_->lend(gateMemory_);
+        MemoryPool::retire(gateMemory_);
         imageGate_ = nullptr;
         image_ = std::move(copy);
         ++imageEpoch_;
@@ -361,8 +368,10 @@ public:
         if (image_.empty())
             return;
         const bool same = std::memcmp(&rgba, &background_, sizeof rgba) == 0;
+        row_.resize(4 * static_cast<std::size_t>(layout_.tileSize())); // may throw: nothing has changed yet
+        for (std::size_t i = 0; i < row_.size(); ++i)
+            row_[i] = rgba[i % 4];
         background_ = rgba;
-        std::vector<float> row;
         for (int tile = 0; tile < layout_.tileCount(); ++tile) {
             auto& s = state_[static_cast<std::size_t>(tile)];
             if (s == TileState::Received || (s == TileState::Background && same))
@@ -374,11 +383,8 @@ public:
             const Region region = layout_.region(tile);
             const Place place = inImage(image_.planes(), region);
             FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither);
-            row.resize(4 * static_cast<std::size_t>(region.width()));
-            for (std::size_t i = 0; i < row.size(); ++i)
-                row[i] = rgba[i % 4];
             for (int y = 0; y < region.height(); ++y)
-                out.setRow(y, row.data(), nullptr);
+                out.setRow(y, row_.data(), nullptr);
             s = TileState::Background;
         }
         imageFrame_ = frame_;
@@ -644,6 +650,7 @@ private:
     Buffer gateMemory_;
     ImageGate* imageGate_ = nullptr; // in gateMemory_, if other ranks see the image
     std::array<float, 4> background_{}, lastBackground_{};
+    std::vector<float> row_; // of background, as wide as a tile
     std::vector<std::atomic<TileState>> state_; // on the display rank
     std::vector<std::int32_t> incomplete_;      // of the last frame
     std::vector<TilesOf> tilesOf_;              // per rank; on the display rank under mutex_
