@@ -105,9 +105,11 @@ DFB_NAMESPACE_BEGIN
 DFB_COMPILED_ONCE DisplayWall::DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout,
                                            OutputFormat format, std::shared_ptr<Executor> executor,
                                            std::size_t poolBytes)
-    : layout_(layout),
-      wall_(std::make_unique<detail::Wall>(std::move(connection), layout, format, std::move(executor), poolBytes))
 {
+    connection->giveUpWithoutMemory([&] {
+        layout_ = layout;
+        wall_ = std::make_unique<detail::Wall>(connection, layout, format, std::move(executor), poolBytes);
+    });
 }
 DFB_COMPILED_ONCE DisplayWall::~DisplayWall() = default;
 

@@ -375,14 +375,16 @@ DFB_COMPILED_ONCE FrameBufferBase::~FrameBufferBase()
 DFB_COMPILED_ONCE void FrameBufferBase::makeEngines(const Config& config)
 {
     std::vector<std::unique_ptr<detail::Engine>> engines;
-    for (std::size_t slot = 0; slot < operations_.size(); ++slot)
-        engines.push_back(detail::makeEngine(connection_, config, *operations_[slot], static_cast<int>(slot)));
-    engines_ = std::move(engines);
     std::vector<detail::Engine*> together;
-    for (const auto& engine : engines_)
-        together.push_back(engine.get());
-    for (detail::Engine* engine : together)
-        engine->setTogether(together);
+    connection_->giveUpWithoutMemory([&] {
+        for (std::size_t slot = 0; slot < operations_.size(); ++slot)
+            engines.push_back(detail::makeEngine(connection_, config, *operations_[slot], static_cast<int>(slot)));
+        for (const auto& engine : engines)
+            together.push_back(engine.get());
+        for (detail::Engine* engine : together)
+            engine->setTogether(together);
+    });
+    engines_ = std::move(engines);
     next_ = 0;
     lastEnded_ = engines_.front().get();
 }
@@ -406,11 +408,13 @@ DFB_COMPILED_ONCE void FrameBufferBase::resize(int width, int height)
     for (const auto& engine : engines_)
         if (engine->isOpen())
             detail::failArgument("resize() while a frame is open: end() it first");
-    Config config = this->config();
-    config.image.width = width;
-    config.image.height = height;
-    engine().allGather({}, "resize()"); // the new engines do not hear of other calls
-    makeEngines(config);
+    connection_->giveUpWithoutMemory([&] {
+        Config config = this->config();
+        config.image.width = width;
+        config.image.height = height;
+        engine().allGather({}, "resize()"); // the new engines do not hear of other calls
+        makeEngines(config);
+    });
 }
 #endif
 

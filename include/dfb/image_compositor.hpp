@@ -375,7 +375,8 @@ DFB_COMPILED_ONCE std::unique_ptr<detail::Operations> ImageCompositor::makeOpera
 
 DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& config)
 {
-    auto operations = makeOperations(config.image);
+    std::unique_ptr<detail::Operations> operations;
+    connection_->giveUpWithoutMemory([&] { operations = makeOperations(config.image); });
     engine_ = detail::makeEngine(connection_, config, *operations, 0);
     operations_ = std::move(operations);
     regions_.clear();
@@ -414,11 +415,13 @@ DFB_COMPILED_ONCE void ImageCompositor::resize(int width, int height)
 {
     if (engine_->isOpen())
         detail::failArgument("resize() while a picture is open: end() it first");
-    FrameBufferConfig config = engine_->config();
-    config.image.width = width;
-    config.image.height = height;
-    engine_->allGather({}, "resize()"); // the new engine does not hear of other calls
-    makeEngine(config);
+    connection_->giveUpWithoutMemory([&] {
+        FrameBufferConfig config = engine_->config();
+        config.image.width = width;
+        config.image.height = height;
+        engine_->allGather({}, "resize()"); // the new engine does not hear of other calls
+        makeEngine(config);
+    });
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::begin(const FrameConfig& frame)

@@ -350,6 +350,17 @@ public:
         }
     }
 
+    // As giveUpIfThrows(), but only if memory is lacking: other errors are those of all ranks.
+    void giveUpWithoutMemory(detail::FunctionRef<void()> step)
+    {
+        try {
+            step();
+        } catch (const std::bad_alloc& e) {
+            leave(e.what());
+            throw;
+        }
+    }
+
 private:
     using Clock = std::chrono::steady_clock;
 

@@ -142,12 +142,17 @@ public:
         // Counts it now, so that the figures of the frame include it even if it has to wait.
         bytesSent_ += static_cast<std::int64_t>(message.size());
         ++messagesSent_;
-        if (carriesOn(header.kind, message))
-            ++sentOn_;
-        if (needsCredit(header.kind))
-            flow_.send(destination, std::move(message));
-        else
-            pass(destination, std::move(message));
+        const bool isOn = carriesOn(header.kind, message);
+        sentOn_ += isOn;
+        try {
+            if (needsCredit(header.kind))
+                flow_.send(destination, std::move(message));
+            else
+                pass(destination, std::move(message));
+        } catch (...) { // no rank will take it
+            sentOn_ -= isOn;
+            throw;
+        }
     }
 
     void send(int destination, MessageKind kind, std::int64_t number, const Bytes& body = {})
@@ -420,9 +425,10 @@ public:
     template <class Operation>
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, const char* how, Operation operation)
     {
-        Bytes mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
+        Bytes mine;
         std::vector<std::int64_t> reduced;
         makePart([&] {
+            mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
             for (const std::int64_t value : values)
                 mine.put(value);
             reduced.resize(values.size());
@@ -444,10 +450,13 @@ public:
     // allReduce().
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call)
     {
-        Bytes mine = partOf(call); // then, for each rank: its number, the size, the bytes
-        mine.put(static_cast<std::int32_t>(rank()));
-        mine.put(static_cast<std::uint64_t>(own.size()));
-        makePart([&] { mine.append(own.data(), own.data() + own.size()); });
+        Bytes mine; // the call; then, for each rank: its number, the size, the bytes
+        makePart([&] {
+            mine = partOf(call);
+            mine.put(static_cast<std::int32_t>(rank()));
+            mine.put(static_cast<std::uint64_t>(own.size()));
+            mine.append(own.data(), own.data() + own.size());
+        });
         const auto combine = [](ByteReader& a, ByteReader& b, Bytes& out) {
             a.copyTo(out);
             b.copyTo(out);

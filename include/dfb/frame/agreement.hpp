@@ -254,6 +254,8 @@ inline Agreement agree(Mailbox& mailbox, FunctionRef<Agreement()> makeMine)
         mine = {false, e.info().message, mailbox.rank()};
     } catch (const std::exception& e) { // the others must not wait for this rank
         mine = {false, e.what(), mailbox.rank()};
+    } catch (...) {
+        mine = {false, "an exception that is not a std::exception", mailbox.rank()};
     }
     auto all = Agreement::from(mailbox.reduce(mine.bytes(), Agreement::combine));
     if (!all.fine) {

@@ -749,7 +749,8 @@ private:
         const auto sendToDisplay = [this](Buffer&& message, std::size_t raw) {
             if (raw > 0)
                 compression_.sent(config_.image.displayRank, raw, message.size());
-            mailbox_->send(config_.image.displayRank, std::move(message));
+            // The display rank waits for it.
+            mailbox_->makePart([&] { mailbox_->send(config_.image.displayRank, std::move(message)); });
         };
         pipeline_ = std::make_unique<TilePipeline>(
             pool_, config_, operations_, rank(), size(), mailbox_->address(), sendToDisplay,
@@ -792,7 +793,10 @@ private:
 DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,
                                                      Operations& operations, int slot)
 {
-    return std::make_unique<FrameEngine>(std::move(connection), std::move(config), operations, slot);
+    std::unique_ptr<Engine> engine;
+    connection->giveUpWithoutMemory(
+        [&] { engine = std::make_unique<FrameEngine>(connection, std::move(config), operations, slot); });
+    return engine;
 }
 #endif
 

@@ -58,14 +58,14 @@ public:
     // ---- failure
 
     // Runs `body`. If it throws, calls fail() and returns false. `where`: the place of the error, as far as it is known
-    // when `body` throws.
+    // when `body` throws. If there is no memory to report the error, the connection fails.
     bool guarded(FunctionRef<void()> body, const ErrorInfo& where = {})
     {
         try {
             body();
             return true;
         } catch (...) {
-            fail(errorInfoOf(std::current_exception(), where));
+            mailbox_.orGiveUp([&] { fail(errorInfoOf(std::current_exception(), where)); });
             return false;
         }
     }

@@ -13,6 +13,7 @@
 #include <cstdint>
 #include <cstdlib>
 #include <exception>
+#include <functional>
 #include <limits>
 #include <memory>
 #include <mutex>
@@ -754,6 +755,87 @@ TEST_CASE("Wherever in a frame a rank's memory fails, no rank waits for it in va
         }
         CHECK(place < 1000);
     }
+}
+
+TEST_CASE("Wherever a rank's memory fails while objects are made, no rank waits for it in vain", "[counters]")
+{
+    struct Case {
+        const char* name;
+        std::function<void(const std::shared_ptr<dfb::Connection>&, const std::function<void()>& arm)> run;
+    };
+    using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, dfb::InprocTransport>;
+    const auto makeConfig = [] {
+        dfb::FrameBufferConfig config(48, 48);
+        config.executor = std::make_shared<dfb::CallerExecutor>(); // all is done in this thread
+        return config;
+    };
+    const std::vector<Case> cases{{"a framebuffer",
+                                   [&](const auto& connection, const auto& arm) {
+                                       dfb::FrameBufferConfig config = makeConfig();
+                                       config.framesInFlight = 2;
+                                       arm();
+                                       const Fb fb(connection, std::move(config));
+                                   }},
+                                  {"its resize()",
+                                   [&](const auto& connection, const auto& arm) {
+                                       Fb fb(connection, makeConfig());
+                                       arm();
+                                       try {
+                                           fb.resize(64, 32);
+                                       } catch (...) {
+                                           if (fb.imageFrame() != -1) // asks an engine that is still there
+                                               std::abort();
+                                           throw;
+                                       }
+                                   }},
+                                  {"an image compositor",
+                                   [&](const auto& connection, const auto& arm) {
+                                       dfb::FrameBufferConfig config = makeConfig();
+                                       arm();
+                                       dfb::ImageCompositor(connection, dfb::ImageBlend::ByDepth, std::move(config));
+                                   }},
+                                  {"its resize()",
+                                   [&](const auto& connection, const auto& arm) {
+                                       dfb::ImageCompositor images(connection, dfb::ImageBlend::ByDepth, makeConfig());
+                                       arm();
+                                       images.resize(64, 32);
+                                   }},
+                                  {"a wall", [&](const auto& connection, const auto& arm) {
+                                       const dfb::WallLayout layout{2, 1, 48, 48, 0, 0, {0, 1}};
+                                       const auto executor = std::make_shared<dfb::CallerExecutor>();
+                                       arm();
+                                       const dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8,
+                                                                   executor);
+                                   }}};
+    for (const Case& c : cases)
+        for (const int failing : {0, 1}) {
+            bool hasFailed = true;
+            for (int place = 0; hasFailed && place < 1000; ++place) {
+                std::vector<std::string> texts(2);
+                dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+                    std::string& text = texts[static_cast<std::size_t>(communicator.rank())];
+                    const auto connection = dfb::connect<dfb::InprocTransport>(communicator);
+                    try {
+                        c.run(connection, [&] {
+                            if (communicator.rank() == failing)
+                                allocationsUntilFailure = place;
+                        });
+                        text = "fine";
+                    } catch (const std::exception& e) {
+                        text = e.what();
+                    }
+                    if (communicator.rank() == failing) {
+                        hasFailed = allocationsUntilFailure < 0;
+                        allocationsUntilFailure = -1;
+                    }
+                });
+                INFO(c.name << ", rank " << failing << ", allocation " << place << ": " << texts[0] << "; "
+                            << texts[1]);
+                CHECK(texts[0].find("peerTimeout") == std::string::npos);
+                CHECK(texts[1].find("peerTimeout") == std::string::npos);
+            }
+            CHECK_FALSE(hasFailed);
+        }
 }
 
 TEST_CASE("What is too large for memory is named with its bytes and its rank, on every rank", "[counters]")
