@@ -41,6 +41,13 @@ public:
         });
     }
 
+    // Called by a handler: ends the connection after this answer, so that one that waits is served.
+    static void endAfter(httplib::Response& response)
+    {
+        response.set_header("Connection", "close");
+        isLast = true;
+    }
+
     // Ends all connections. First waits up to `least` for clients to end theirs, while requests are still answered;
     // then, until `most` has passed in all, for answers that are under way. Any thread.
     void hangUp(std::chrono::milliseconds least, std::chrono::milliseconds most)
@@ -55,6 +62,7 @@ public:
 
 private:
     using Clock = std::chrono::steady_clock;
+    inline static thread_local bool isLast = false; // the answer of this thread, which serves one connection at a time
 
     // A thread for each connection. While all are busy no connection is accepted: otherwise the job could run out of
     // file descriptors.
@@ -195,7 +203,8 @@ private:
         Exchange exchange(socket);
         while (isWell && !isClosed && exchange.begin()) {
             countAnswers(1);
-            isWell = process_request(exchange, false, isClosed, nullptr);
+            isLast = false;
+            isWell = process_request(exchange, false, isClosed, nullptr) && !isLast;
             countAnswers(-1);
         }
         const std::lock_guard<std::mutex> lock(mutex_);

@@ -289,7 +289,7 @@ private:
             if (isSame(request.get_param_value("token"), token_))
                 return httplib::Server::HandlerResponse::Unhandled;
             response.status = 403;
-            response.set_header("Connection", "close");
+            BoundedServer::endAfter(response);
             response.set_content("The token is wrong: use the address that the job has printed.\n", "text/plain");
             return httplib::Server::HandlerResponse::Handled;
         });
@@ -303,32 +303,37 @@ private:
         get("/picture.png", &Server::picture);
         get("/stats", &Server::stats);
         const auto post = [this](const char* path, void (Server::*answer)(const Json&, Response&)) {
-            // Reads the body piece by piece, because the library limits only bodies that say how long they are.
-            http_.Post(path, [this, answer](const Request&, Response& response, const httplib::ContentReader& read) {
-                guarded(response, [&] {
-                    std::string body;
-                    bool isTooLong = false;
-                    const bool isWhole = read([&](const char* data, std::size_t size) {
-                        isTooLong = body.size() + size > mostBody;
-                        if (!isTooLong)
-                            body.append(data, size);
-                        return !isTooLong;
-                    });
-                    if (!isWhole) {
-                        if (isTooLong || response.status < 400)
-                            response.status = 413;
-                        response.set_header("Connection", "close");
-                        return;
-                    }
-                    const Json json = Json::parse(body, nullptr, false);
-                    if (!json.is_object())
-                        throw Refused("the body is no JSON object");
-                    (this->*answer)(json, response);
-                });
+            http_.Post(path, [=](const Request& request, Response& response, const httplib::ContentReader& read) {
+                guarded(response, [&] { take(request, response, read, answer); });
             });
         };
         post("/camera", &Server::camera);
         post("/command", &Server::command);
+    }
+
+    // Reads the body piece by piece, because the library limits only bodies that say how long they are.
+    void take(const Request& request, Response& response, const httplib::ContentReader& read,
+              void (Server::*answer)(const Json&, Response&))
+    {
+        std::string body;
+        bool isTooLong = false;
+        const auto add = [&](const char* data, std::size_t size) {
+            isTooLong = body.size() + size > mostBody;
+            if (!isTooLong)
+                body.append(data, size);
+            return !isTooLong;
+        };
+        if (request.is_multipart_form_data()) // for which the library has another reader
+            throw Refused("the body is no JSON object");
+        if (!read(add)) {
+            if (isTooLong || response.status < 400)
+                response.status = 413;
+            return BoundedServer::endAfter(response);
+        }
+        const Json json = Json::parse(body, nullptr, false);
+        if (!json.is_object())
+            throw Refused("the body is no JSON object");
+        (this->*answer)(json, response);
     }
 
     template <class Answer>
@@ -364,6 +369,7 @@ private:
             shown = shown_;
             if (!shown || shown->number <= after) {
                 response.status = isOver_ ? 410 : 204;
+                BoundedServer::endAfter(response);
                 return;
             }
         }

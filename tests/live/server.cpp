@@ -198,6 +198,11 @@ TEST_CASE("a live view answers nobody without the token")
     CHECK(f.wishes().ends == 0);
     CHECK(f.get(f.path("/")) == 200);
     CHECK(f.get(f.path("/nothing")) == 404);
+    const Socket socket(f.port);
+    REQUIRE(socket.send("GET /stats HTTP/1.1\r\nHost: x\r\n\r\n"));
+    const auto start = std::chrono::steady_clock::now();
+    CHECK(socket.receiveAll().rfind("HTTP/1.1 403", 0) == 0); // until the connection ends, which keeps no thread
+    CHECK(std::chrono::steady_clock::now() - start < std::chrono::seconds(2)); // after which idle ones end
 }
 
 TEST_CASE("a live view gives pictures back as they were shown")
@@ -387,6 +392,9 @@ TEST_CASE("requests and bodies have limits")
                             + "\r\n0\r\n\r\n"));
         CHECK(socket.receiveAll().rfind("HTTP/1.1 413", 0) == 0);
     }
+    const auto form = f.client().Post(f.path("/camera"), "--x--\r\n", "multipart/form-data; boundary=x");
+    REQUIRE(form);
+    CHECK(form->status == 400);
     const std::string many(1 << 16, ' ');
     const auto isCutOff = [&](const std::string& start, const std::string& more) {
         const Socket socket(f.port);
