@@ -36,7 +36,9 @@ for argument in "$@"; do
         ;;
     esac
     file=$argument
-    [ -f "$file" ] || file=${argument%%:*} # behind a colon: how it looks, or a data set
+    while [ ! -f "$file" ] && [ "$file" != "${file%:*}" ]; do
+        file=${file%:*} # behind a colon: how it looks, or a data set
+    done
     if [ ! -f "$file" ] || [ ! -r "$file" ]; then
         echo "demo.sh: cannot read the file '$file'" >&2
         exit 1

@@ -86,6 +86,10 @@ public:
         }
         values_.resize(std::size_t(size_[0]) * std::size_t(size_[1]) * std::size_t(size_[2]));
         std::ifstream file(volume.path, std::ios::binary);
+        const std::int64_t bytes =
+            std::int64_t(volume.size[0]) * volume.size[1] * volume.size[2] * volume.bytesPerVoxel;
+        if (!volume.path.empty() && (!file.seekg(0, std::ios::end) || file.tellg() != bytes))
+            throw std::runtime_error(volume.path + ": cannot be read, or does not have the size that its name says");
         std::vector<char> row(static_cast<std::size_t>(size_[0] * volume.bytesPerVoxel));
         float* to = values_.data();
         for (int z = first_[2]; z < first_[2] + size_[2]; ++z)
@@ -94,7 +98,7 @@ public:
                     const std::int64_t before = std::int64_t(z) * volume.size[1] + y;
                     file.seekg((before * volume.size[0] + first_[0]) * volume.bytesPerVoxel);
                     if (!file.read(row.data(), static_cast<std::streamsize>(row.size())))
-                        throw std::runtime_error(volume.path + ": cannot be read, or is shorter than its name says");
+                        throw std::runtime_error(volume.path + ": cannot be read");
                 }
                 for (int x = 0; x < size_[0]; ++x)
                     *to++ = volume.path.empty() ? knot(float(first_[0] + x), float(y), float(z))

@@ -364,7 +364,8 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
             look.hi = file.range[1];
         }
     }
-    if (!(look.scale() > 0 && std::isfinite(look.scale())))
+    if (!(look.scale() > 0 && std::isnormal(look.scale()) && std::isfinite(info.maximum - look.lo)
+          && std::isfinite(info.least - look.lo))) // denormal numbers count as 0 while rendering
         throw std::runtime_error(source.name + ": the range from " + textOf(look.lo) + " to " + textOf(look.hi)
                                  + " is too small or too large to tell values apart");
     look.isovalues = choice.isovalues;

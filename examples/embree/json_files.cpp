@@ -177,6 +177,8 @@ TransferFile parseTransfer(const std::string& text, const std::string& path)
             "with a 'range', values of points are from 0 to 1: 0 stands for its low end, 1 for its high end");
     if (range.is_null()) {
         file.range = {file.points.front().value, file.points.back().value};
+        require(std::isnormal(1 / (file.range[1] - file.range[0])),
+                "its values are too near or too far from each other");
         for (TransferPoint& p : file.points)
             p.value = (p.value - file.range[0]) / (file.range[1] - file.range[0]);
     } else if (range != "auto") {

@@ -283,7 +283,8 @@ private:
         text += " --size " + std::to_string(settings_.width) + 'x' + std::to_string(settings_.height);
         if (samples > 1)
             text += " --spp " + std::to_string(samples);
-        text += " --ao " + std::to_string(settings_.aoRays); // also 0, which is not the default for files
+        if (o_.pathBounces == 0)
+            text += " --ao " + std::to_string(settings_.aoRays); // also 0, which is not the default for files
         return text + " --background " + number(params_.background[0]) + ',' + number(params_.background[1]) + ','
                + number(params_.background[2]);
     }

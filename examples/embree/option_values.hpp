@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cctype>
 #include <cstdlib>
 #include <sstream>
 #include <string>
@@ -25,15 +26,19 @@ inline CLI::Validator ending(std::vector<std::string> endings)
     return CLI::Validator([endings](std::string& path) { return checkEnding(path, endings); }, "");
 }
 
-// A number within [lo, hi] and nothing else; CLI11's own range lets NaN pass.
+// A number within [lo, hi] and nothing else; CLI11's own range lets NaN pass. Takes leading zeros away.
 inline CLI::Validator number(double lo, double hi)
 {
     return CLI::Validator(
         [lo, hi](std::string& text) {
             char* end = nullptr;
             const double value = std::strtod(text.c_str(), &end);
-            if (!text.empty() && *end == '\0' && value >= lo && value <= hi)
+            if (!text.empty() && *end == '\0' && value >= lo && value <= hi) {
+                const std::size_t zeros = text.find_first_not_of("+-"), digits = text.find_first_not_of('0', zeros);
+                if (digits != std::string::npos && std::isdigit(static_cast<unsigned char>(text[digits])))
+                    text.erase(zeros, digits - zeros); // CLI11 would take 010 for the octal 8
                 return std::string();
+            }
             std::ostringstream message;
             message.precision(16);
             message << "'" << text << "' is no number from " << lo << " to " << hi;

@@ -110,7 +110,7 @@ private:
     template <class T>
     void number(const char* name, T& value, double lo, double hi, const char* form, const char* what)
     {
-        app_.add_option(name, value, what)->check(detail::number(lo, hi))->option_text(form)->group(group_);
+        app_.add_option(name, value, what)->transform(detail::number(lo, hi))->option_text(form)->group(group_);
     }
     void text(const char* name, std::string& value, const char* form, const char* what)
     {
@@ -224,13 +224,15 @@ private:
         text("--size", size_, "WxH", "Size of the image in pixels, each side 1 to 65536; default 1024x1024");
         number("--frames", options_.frames, 1, most, "N", "Frames of one turn around the scene; default 1");
         number("--spp", options_.passes, 1, 65536, "N",
-               "Samples per pixel, one pass each; default 1, in the pixel's centre");
+               "Samples per pixel, one pass each; default 1, in the pixel's centre; with --live 16");
         number("--adaptive", options_.adaptive, 0, 1, "ERR",
                "Render a tile until the standard error of its pixels is at most this, from 8 to --spp samples; default "
                "0: all have --spp");
         number("--ao", options_.aoRays, 0, 4096, "N",
-               "Ambient occlusion of surfaces and spheres, with N rays per hit; default 16 for files that are not "
-               "volumes, without --path; otherwise 0: none. Bricks then also hold the geometry within --ao-distance of "
+               "Ambient occlusion of surfaces and spheres, with N rays per hit; default 16, with --live 4, for files "
+               "that are "
+               "not volumes, without --path; otherwise 0: none. Bricks then also hold the geometry within "
+               "--ao-distance of "
                "them");
         number("--ao-distance", options_.aoDistance, 1e-6, 10, "D",
                "Length of the rays of --ao, and reach of --shadows, in units of the scene's largest extent; default "
@@ -343,7 +345,9 @@ private:
         refuse(options_.live && options_.distribution != Distribution::Owned, "--distribution",
                "other than owned does not go with --live");
         const bool isData = options_.mode == Mode::Data;
-        refuse(options_.mode == Mode::Image, "--blend", "does not go with --mode image");
+        for (const char* other : {"--blend", "--min-transmittance"})
+            refuse(options_.mode == Mode::Image, other, "does not go with --mode image: nothing is blended");
+        refuse(options_.blend == Blending::Nearest, "--min-transmittance", "does not go with --blend nearest");
         for (const char* other : {"--adaptive", "--interleave", "--deep", "--wall", "--exposure"})
             refuse(options_.blend != Blending::Sort, other, "does not go with --blend order or nearest");
         refuse(options_.mode == Mode::Image, "--cut", "does not go with --mode image: it has no bricks");
@@ -356,7 +360,8 @@ private:
                "cost does not go with --blend order");
         refuse(options_.mode != Mode::Image, "--distribution", "needs --mode image");
         refuse(options_.mode != Mode::Image, "--path", "needs --mode image: paths go through the whole scene");
-        for (const char* other : {"--ao", "--ao-distance", "--shadows", "--opacity"})
+        refuse(options_.pathBounces > 0 && options_.aoRays > 0, "--ao", "does not go with --path");
+        for (const char* other : {"--ao-distance", "--shadows", "--opacity"})
             refuse(options_.pathBounces > 0, other, "does not go with --path");
         refuse(!isData, "--interleave", "needs --mode data");
         refuse(!isData, "--deep", "needs --mode data");

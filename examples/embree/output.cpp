@@ -95,11 +95,14 @@ void writePngFile(const std::string& path, int width, int height, int bits, bool
 void requireWritable(const std::string& path)
 {
     std::error_code ignored;
-    const bool existed = std::filesystem::exists(path, ignored);
+    const auto kind = std::filesystem::symlink_status(path, ignored).type();
+    const bool existed = kind != std::filesystem::file_type::not_found;
+    if (existed && !std::filesystem::is_regular_file(path, ignored) && kind != std::filesystem::file_type::directory)
+        return; // the reader of a pipe would take it for the end; a link may lead to nothing yet
     errno = 0;
     if (!std::ofstream(path, std::ios::binary | std::ios::app))
         detail::failToWrite(path, std::strerror(errno));
-    if (!existed && !ignored)
+    if (!existed)
         std::filesystem::remove(path, ignored);
 }
 

@@ -79,6 +79,17 @@ public:
             files.layers = detail::parseLayers("--layers", layers_);
     }
 
+    // The path of a file, or of the one for the first frame.
+    static std::filesystem::path fullName(const std::string& name)
+    {
+        std::string first = name;
+        try {
+            first = FramePattern(name).path(0);
+        } catch (const std::invalid_argument&) { // checkPatterns() says so
+        }
+        return std::filesystem::absolute(first).lexically_normal();
+    }
+
     // Throws CLI::ValidationError if two of the files have one name.
     static void refuseEqualNames(const OutputFiles& files)
     {
@@ -90,8 +101,7 @@ public:
         std::map<std::filesystem::path, const char*> options;
         for (const auto& [option, name] : all)
             if (!name.empty())
-                if (const auto [other, isNew] = options.emplace(std::filesystem::path(name).lexically_normal(), option);
-                    !isNew)
+                if (const auto [other, isNew] = options.emplace(fullName(name), option); !isNew)
                     throw CLI::ValidationError(option, "'" + name + "' is also written by " + other->second);
     }
 

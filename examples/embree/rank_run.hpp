@@ -309,8 +309,11 @@ private:
             std::printf("order undefined at %lld pixels; merging changed none by more than %.3g\n",
                         static_cast<long long>(last.report.orderUndefinedPixels), last.report.mergeErrorBound);
         if (last.report.wireErrorBound > 0)
-            std::printf("tiles travelled as %s: no colour or alpha is off by more than %.3g\n",
-                        dfb::nameOf(last.report.wireColor), last.report.wireErrorBound);
+            std::printf("%s: no colour or alpha is off by more than %.3g\n",
+                        last.report.wireColor == dfb::WireFormat::Float32
+                            ? "pixels end at --min-transmittance"
+                            : ("tiles travelled as " + std::string(dfb::nameOf(last.report.wireColor))).c_str(),
+                        last.report.wireErrorBound);
         files_.say();
     }
 

@@ -145,7 +145,9 @@ struct Scene {
                 for (int i = 0; i < 8; ++i)
                     take(object.toWorld(object.shown.corner(i)), 0);
         });
-        noteOn(object.source, visible.points.empty());
+        const std::vector<float>& isovalues = object.source.look.isovalues;
+        noteOn(object.source,
+               visible.points.empty() || (!isovalues.empty() && isovalues.back() <= object.source.info.least));
         volumes.push_back(std::move(object));
     }
     void add(Mesh mesh, bool fit, const FileLook& look = {}, const std::string& name = {})
@@ -280,7 +282,9 @@ private:
         const auto [lo, hi] = source.range ? *source.range : rangeOf(source);
         const VolumeLook& look = source.look;
         const auto value = [&look](float v) { return (v - look.lo) * look.scale(); };
-        if (look.hasIsovalueIn(lo, hi) || !TransferFunction(1, look.points).isTransparent(value(lo), value(hi)))
+        const bool isAtLeast = !look.isovalues.empty() && look.isovalues.back() <= lo; // nothing is below the surface
+        if ((look.hasIsovalueIn(lo, hi) && !isAtLeast)
+            || !TransferFunction(1, look.points).isTransparent(value(lo), value(hi)))
             return;
         notes.push_back(source.name + ": there is nothing to see: "
                         + (lo == hi ? "all voxels are " + textOf(lo)

@@ -96,11 +96,12 @@ inline void setRange(VolumeInfo& info, const VoxelRange& range, bool isFloat, co
     if (hi == info.minimum) { // all are equal: take a value above, or else one below
         info.maximum = hi + std::max(1.0f, std::fabs(hi) / 1024);
         if (!std::isfinite(info.maximum)) {
-            info.minimum = hi / 2;
+            info.minimum = hi - hi / 8;
             info.maximum = hi;
         }
     }
-    if (!std::isnormal(info.maximum - info.minimum) || !std::isfinite(info.maximum - info.least))
+    if (!std::isnormal(info.maximum - info.minimum) || !std::isnormal(1 / (info.maximum - info.minimum))
+        || !std::isfinite(info.maximum - info.least))
         throw std::runtime_error(name + ": its values go from " + textOf(lo) + " to " + textOf(hi)
                                  + ", of which no image can be made; is the byte order right?");
 }

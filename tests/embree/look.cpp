@@ -244,6 +244,7 @@ TEST_CASE("A transfer function is read from JSON", "[look][transfer]")
             R"({"range": [0, 9], "points": [{"value": 0, "color": [0,0,0], "opacity": 0}, {"value": 9, "color": [0,0,0], "opacity": 1}]})",
             "{\"range\": 5, " + two + "}",
             R"({"points": [{"value": 1, "color": [0,0,0], "opacity": 0}, {"value": 1, "color": [0,0,0], "opacity": 0}]})",
+            R"({"points": [{"value": -3e38, "color": [0,0,0], "opacity": 0}, {"value": 3e38, "color": [0,0,0], "opacity": 0}]})",
             R"({"points": [{"value": 0, "color": [0,0,0], "opacity": 0}, {"value": 1, "color": [0,0,2], "opacity": 0}]})",
             R"({"points": [{"value": 0, "color": [0,0,0], "opacity": 0}, {"value": 1, "color": [0,0,1], "opacity": 2}]})",
             R"({"points": [{"value": 0, "color": [0,0,0], "opacity": 0}, {"value": 1, "color": "red", "opacity": 1}]})",

@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <array>
+#include <filesystem>
 #include <map>
 #include <string>
 #include <utility>
@@ -301,6 +302,9 @@ TEST_CASE("What would do nothing is refused", "[options]")
         words.insert(words.end(), {"--mode", "image", "--path", "2"});
         checkRefused(words);
     }
+    CHECK(parse({"a.ply", "--mode", "image", "--path", "2", "--ao", "0"}).options); // as the page of a live view says
+    checkRefused({"--min-transmittance", "0.1", "--mode", "image"});
+    checkRefused({"--min-transmittance", "0.1", "--blend", "nearest"});
 }
 
 TEST_CASE("Two files with one name are refused", "[options]")
@@ -312,11 +316,15 @@ TEST_CASE("Two files with one name are refused", "[options]")
     checkRefused({"--trace", "a.json", "--stats", "a.json"});
     checkRefused({"--save-options", "a.json", "--stats", "a.json"});
     checkRefused({"--save-options", "a.json", "--trace", "b/../a.json"});
+    checkRefused({"--alpha", "a%d.pfm", "--depth", "a%01d.pfm", "--frames", "3"});
+    checkRefused({"--depth", (std::filesystem::current_path() / "a.pfm").string(), "--alpha", "a.pfm"});
     CHECK(parse({"demo", "--output", "a.pfm", "--alpha", "b.pfm", "--depth", "b/a.pfm", "--aux", "a"}).options);
 }
 
 TEST_CASE("Of an option that is given twice the last counts", "[options]")
 {
+    CHECK(options({"demo", "--frames", "010"}).frames == 10); // not octal
+    CHECK(options({"demo", "--frames", "08"}).frames == 8);
     const Options o =
         options({"demo",         "--spp",    "2",        "--size",   "5x5",         "--mode",  "image",  "--background",
                  "1,1,1",        "--output", "a.png",    "--dither", "--mode=data", "--spp=3", "--size", "7x6",

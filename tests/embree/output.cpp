@@ -5,11 +5,13 @@
 
 #include <nlohmann/json.hpp>
 #include <png.h>
+#include <sys/stat.h>
 
 #include <dfb/image.hpp>
 
 #include <cmath>
 #include <cstdint>
+#include <filesystem>
 #include <limits>
 #include <random>
 #include <sstream>
@@ -349,6 +351,14 @@ TEST_CASE("To ask whether a file can be written leaves all as it is", "[output]"
     std::string text;
     std::ifstream(old) >> text;
     CHECK(text == "text");
+    const std::filesystem::path link = folder / "link";
+    std::filesystem::create_symlink("nothing", link);
+    requireWritable(link.string());
+    CHECK(std::filesystem::is_symlink(link));
+    CHECK_FALSE(std::filesystem::exists(folder / "nothing"));
+    const std::string pipe = folder / "pipe";
+    REQUIRE(mkfifo(pipe.c_str(), 0600) == 0);
+    requireWritable(pipe); // returns, though nobody reads
 }
 
 } // namespace output_cases

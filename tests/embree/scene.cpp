@@ -48,6 +48,11 @@ TEST_CASE("All ranks have the same notes for the user", "[scene]")
         }
     CHECK(loadRankScene(optionsFor({"demo"}), {}).notes.empty());
     CHECK(loadRankScene(optionsFor({"synthetic"}), {}).notes.empty());
+    const std::string some = folder.write("some_4x4x4_uint8.raw", std::string(63, '\1') + '\7');
+    for (const char* isovalue : {"0", "8"}) // all voxels are within the surface, or all are outside
+        CHECK(test::contains(loadRankScene(optionsFor({some, "--isovalue", isovalue}), {}).notes.at(0),
+                             "nothing to see"));
+    CHECK(loadRankScene(optionsFor({some, "--isovalue", "5"}), {}).notes.empty());
 }
 
 TEST_CASE("Coordinates far from 0 are noted where float32 rounds them visibly", "[scene]")
@@ -97,10 +102,12 @@ TEST_CASE("A range that a float cannot divide by is named", "[scene]")
 {
     const test::TemporaryFolder folder;
     const std::string volume = folder.write("v_4x4x4_uint8.raw", std::string(64, 'v')),
-                      transfer = folder.write("t.json", R"({"points": [{"value": 0, "opacity": 0, "color": [0, 0, 0]},
-                          {"value": 1e-45, "opacity": 1, "color": [1, 1, 1]}]})");
-    for (const std::string& look : {std::string("range=0,1e-45"), std::string("range=-3e38,3e38"),
-                                    "transfer=" + transfer, std::string("range=0,1e-45:isovalue=0")})
+                      transfer = folder.write(
+                          "t.json", R"({"range": [0, 1e-45], "points": [{"value": 0, "opacity": 0, "color": [0, 0, 0]},
+                          {"value": 1, "opacity": 1, "color": [1, 1, 1]}]})");
+    for (const std::string& look :
+         {std::string("range=0,1e-45"), std::string("range=-3e38,3e38"), std::string("range=-1.6e38,1.6e38"),
+          "transfer=" + transfer, std::string("range=0,1e-45:isovalue=0")})
         for (const std::string& error : test::ofRanks<std::string>(2, [&](const Loaders& loaders) {
                  return test::errorOf([&] { loadRankScene(optionsFor({volume + ':' + look}), loaders); });
              }))
