@@ -525,8 +525,7 @@ private:
         const auto first = in.get<std::int32_t>();
         std::string call = in.getText();
         if (first < 0) {
-            connection_
-                ->throwIfFailed(); // a rank that waited too long makes another call than the others, from then on
+            connection_->throwIfFailed(); // after a time-out, ranks make different calls
             throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, std::move(call)), connection_->throwByAll());
         }
         read(in);
