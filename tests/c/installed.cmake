@@ -1,5 +1,6 @@
 # cmake -DBUILD= -DSTAGE= -DADAPTER= -DLIBDIR= -DMPICC= -DMPIFORT= -P installed.cmake
-# Installs component c into STAGE, and builds programs there as the adapter's README.md says. MPIFORT may be empty.
+# Installs component c into STAGE, and builds programs there as the adapter's README.md says; minimal.c also with the
+# flags of pkg-config, if that is there. MPIFORT may be empty.
 cmake_minimum_required(VERSION 3.21)
 file(REMOVE_RECURSE ${STAGE})
 execute_process(COMMAND ${CMAKE_COMMAND} --install ${BUILD} --component c --prefix ${STAGE} COMMAND_ERROR_IS_FATAL ANY)
@@ -19,3 +20,9 @@ foreach(line IN LISTS lines)
   string(REGEX REPLACE "^mpif90" "${MPIFORT}" line "${line}")
   execute_process(COMMAND sh -ec "IFS=; DIR='${STAGE}'; ${line}" WORKING_DIRECTORY ${STAGE} COMMAND_ERROR_IS_FATAL ANY)
 endforeach()
+find_program(pkg_config pkg-config)
+if(pkg_config)
+  execute_process(WORKING_DIRECTORY ${STAGE} COMMAND_ERROR_IS_FATAL ANY COMMAND ${CMAKE_COMMAND} -E env
+    PKG_CONFIG_PATH=${STAGE}/${LIBDIR}/pkgconfig
+    sh -ec "${MPICC} -std=c99 minimal.c \$(${pkg_config} --cflags --libs dfb_c) -lm -o minimal")
+endif()
