@@ -68,13 +68,9 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
 inline void closeOpaque(CompositeRow& row, int x, int count)
 {
     double* t = row.transmittance.data() + x;
-    double* low = row.transmittanceLow.empty() ? nullptr : row.transmittanceLow.data() + x;
     for (int i = 0; row.minTransmittance > 0 && i < count; ++i)
-        if (t[i] < row.minTransmittance) {
+        if (t[i] < row.minTransmittance)
             t[i] = 0;
-            if (low)
-                low[i] = 0;
-        }
 }
 
 // Blends the auxiliary channels that `row` has. Call it before over(), since it needs the transmittance in front of

@@ -509,19 +509,19 @@ DFB_COMPILED_ONCE void FragmentStore::finishLevels(FinishedTile& out)
     }
 }
 
-// Rounds a row again, in twice the precision, where double does not tell which 8-bit level is nearer. `farthest`: the
-// result of setRow() or setPixels(). Call it after start().
+// Rounds a row again, in twice the precision, where double does not tell which 8-bit level is nearer. Not with a
+// minTransmittance: another precision could end a pixel at another layer. `farthest`: the result of setRow() or
+// setPixels(). Call it after start().
 DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, double farthest)
 {
     // 3 roundings for each layer and pass.
     const double layers = static_cast<double>(fragments_.size()) + info_.passes;
-    if (farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
+    if (info_.minTransmittance > 0 || farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
         return;
     Scratch& scratch = FragmentStore::scratch();
     CompositeRow& row = scratch.exactRow;
     std::vector<DoubleDouble>& sum = scratch.exactSum; // over the passes
     sum.assign(4 * static_cast<std::size_t>(out.width()), {});
-    row.minTransmittance = static_cast<double>(info_.minTransmittance);
     forEachPass(scratch.pointers, [&](std::size_t, auto begin, auto end) {
         scratch.exactCompositor.start(rule(), begin, end, false);
         scratch.exactCompositor.skipRows(y);

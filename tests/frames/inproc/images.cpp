@@ -4,7 +4,10 @@
 #include "random_scene.hpp"
 #include "shuffled.hpp"
 
+#include <dfb/image_compositor.hpp>
+
 #include <algorithm>
+#include <array>
 #include <cstdint>
 #include <functional>
 #include <limits>
@@ -425,6 +428,33 @@ TEST_CASE("allReduce outside frames", "[images]")
     CHECK(minima == std::vector<std::vector<std::int64_t>>(5, {0, -4}));
     CHECK(maxima == std::vector<std::vector<std::int64_t>>(5, {4, std::numeric_limits<std::int64_t>::min()}));
     CHECK(refused == 5);
+}
+
+TEST_CASE("With minTransmittance the levels of a pixel do not depend on other pixels", "[images]")
+{
+    constexpr int width = 64;
+    std::array<std::uint8_t, 2> red{};
+    for (const bool hasTie : {false, true}) // which is rounded again in twice the precision
+        dfb::runRanks(4, [&](dfb::InprocCommunicator communicator) {
+            dfb::FrameBufferConfig config(width, 1);
+            config.minTransmittance = 0.25f;
+            dfb::ImageCompositor images(dfb::connect<dfb::InprocTransport>(communicator), dfb::ImageBlend::InOrder,
+                                        config);
+            std::vector<float> pixels(4 * width);
+            float *tie = pixels.data(), *atLimit = tie + 4 * 40;
+            if (images.rank() == 0) {
+                tie[3] = hasTie ? 0.5f : 0;
+                atLimit[0] = 0.1f, atLimit[3] = 0.75f; // lets through what is the limit
+            } else {
+                atLimit[3] = images.rank() < 3 ? 5e-17f : 1; // so thin that only twice the precision sees it
+                atLimit[0] = images.rank() < 3 ? 0 : 0.9f;
+            }
+            images.composite(dfb::InputImage(pixels.data()), images.rank());
+            if (images.isDisplayRank())
+                red[hasTie] = images.image().rgba8()[4 * 40];
+        });
+    CHECK(red[0] == red[1]);
+    CHECK(red[0] == 83);
 }
 
 } // namespace images_cases
