@@ -476,15 +476,7 @@ public:
 
     // Calls make(), which makes or sends this rank's part of what others wait for. If it lacks memory, the connection
     // fails on all ranks, and this throws std::bad_alloc.
-    void makePart(FunctionRef<void()> make)
-    {
-        try {
-            make();
-        } catch (const std::bad_alloc& e) {
-            giveUp(-1, errorInfo(ErrorKind::Transport, e.what()));
-            throw;
-        }
-    }
+    void makePart(FunctionRef<void()> make) { connection_->giveUpWithoutMemory(make); }
 
 private:
     // Begins the part that this rank brings to a call, with its rank and the call's name. In a combined part the lowest
