@@ -97,8 +97,9 @@ foreach(_component IN LISTS _others)
     COMPONENTS ${_component} EXPECT ${_component} WITHOUT ${_without})
 endforeach()
 
-# The library compiled once, by the user's project: from the package and, with core alone, from the sources. With MPI it
-# also builds a program that was written from the documentation alone, and renders frames.
+# The library compiled once, by the user's project: from the package and, with core alone, from the sources; the latter by
+# another compiler than the one in use, if there is one. With MPI it also builds a program that was written from the
+# documentation alone, and renders frames.
 set(_frame -DFRAME=ON)
 if(TARGET dfb::mpi)
   set(_frame -DDOOR=ON)
@@ -110,8 +111,12 @@ if(TARGET dfb::mpi)
     COMMAND ${CMAKE_CURRENT_BINARY_DIR}/package/find_package_compiled/door)
   set_tests_properties(package.door.np1 package.door.np3 PROPERTIES FIXTURES_REQUIRED dfb_door)
 endif()
+set(_compiler "")
+if(DFB_OTHER_CXX_WORKS)
+  set(_compiler -DCMAKE_CXX_COMPILER=${DFB_OTHER_CXX} -DCMAKE_CXX_FLAGS=)
+endif()
 dfb_add_package_test(add_subdirectory_compiled HOW add_subdirectory WITHOUT MPI TBB Snappy
-  OPTIONS -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF -DFRAME=ON -DCOMPILED=ON)
+  OPTIONS ${_compiler} -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF -DFRAME=ON -DCOMPILED=ON)
 
 # With pkg-config and the compiler alone: all components, core, and all components if pkg-config does not know the
 # dependencies.
