@@ -171,8 +171,14 @@ public:
         return buffer.block_.release();
     }
 
-    // Empties `buffer`, whose block in shared memory is never used again: another process may write there at any time.
-    static void retire(Buffer& buffer) noexcept { buffer.block_.release(); }
+    // Empties `buffer`. If its block is in shared memory, it is never used again: another process may write there at
+    // any time.
+    void retire(Buffer& buffer) noexcept
+    {
+        if (const auto memory = shared(); memory && memory->holds(buffer.data()))
+            buffer.block_.release();
+        buffer = Buffer();
+    }
 
 private:
     static constexpr std::size_t alignment = 64;

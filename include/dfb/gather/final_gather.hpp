@@ -72,7 +72,7 @@ public:
     ~FinalGather()
     {
         if (imageGate_)
-            MemoryPool::retire(gateMemory_);
+            pool_->retire(gateMemory_);
     }
 
     // The image is valid only while imageFrame() >= 0; then imageFrame() is the frame that it shows.
@@ -191,7 +191,7 @@ public:
                 std::memcpy(to.at[c], from.at[c], copy.pixelCount() * record_.pixelBytes(c));
         for (Buffer& plane : image_.release())
             pool_->lend(plane);
-        MemoryPool::retire(gateMemory_);
+        pool_->retire(gateMemory_);
         imageGate_ = nullptr;
         image_ = std::move(copy);
         ++imageEpoch_;
