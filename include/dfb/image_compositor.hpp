@@ -376,8 +376,10 @@ DFB_COMPILED_ONCE std::unique_ptr<detail::Operations> ImageCompositor::makeOpera
 DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& config)
 {
     std::unique_ptr<detail::Operations> operations;
-    connection_->giveUpWithoutMemory([&] { operations = makeOperations(config.image); });
-    engine_ = detail::makeEngine(connection_, config, *operations, 0);
+    connection_->giveUpWithoutMemory([&] {
+        operations = makeOperations(config.image);
+        engine_ = detail::makeEngine(connection_, config, *operations, 0);
+    });
     operations_ = std::move(operations);
     regions_.clear();
     regionOwners_ = nullptr;

@@ -793,10 +793,7 @@ private:
 DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,
                                                      Operations& operations, int slot)
 {
-    std::unique_ptr<Engine> engine;
-    connection->giveUpWithoutMemory(
-        [&] { engine = std::make_unique<FrameEngine>(connection, std::move(config), operations, slot); });
-    return engine;
+    return std::make_unique<FrameEngine>(std::move(connection), std::move(config), operations, slot);
 }
 #endif
 

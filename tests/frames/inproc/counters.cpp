@@ -21,6 +21,7 @@
 #include <numeric>
 #include <string>
 #include <thread>
+#include <utility>
 #include <vector>
 
 // Sanitizers have an operator new of their own.
@@ -743,10 +744,8 @@ TEST_CASE("Wherever in a frame a rank's memory fails, no rank waits for it in va
             } catch (const std::exception& e) {
                 text = e.what();
             }
-            if (communicator.rank() == failing) {
-                hasFailed = allocationsUntilFailure < 0;
-                allocationsUntilFailure = -1;
-            }
+            if (communicator.rank() == failing)
+                hasFailed = std::exchange(allocationsUntilFailure, -1) < 0;
         });
         INFO("rank " << failing << ", allocation " << place << ": " << texts[0] << "; " << texts[1]);
         for (const std::string& text : texts) {
@@ -824,10 +823,8 @@ TEST_CASE("Wherever a rank's memory fails while objects are made, no rank waits 
                     } catch (const std::exception& e) {
                         text = e.what();
                     }
-                    if (communicator.rank() == failing) {
-                        hasFailed = allocationsUntilFailure < 0;
-                        allocationsUntilFailure = -1;
-                    }
+                    if (communicator.rank() == failing)
+                        hasFailed = std::exchange(allocationsUntilFailure, -1) < 0;
                 });
                 INFO(c.name << ", rank " << failing << ", allocation " << place << ": " << texts[0] << "; "
                             << texts[1]);
