@@ -157,6 +157,12 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     static constexpr bool hasDepth = (Channels & depthChannel) != 0;
     using detail::TilePlanes<Channels, Size * Size>::color;
 
+    Tile() = default;
+    // Explicit: a renderer that takes `auto tile` in place of `auto& tile` would fill a copy, and does not compile.
+    explicit Tile(const Tile&) = default;
+    Tile(Tile&&) = default;
+    Tile& operator=(const Tile&) = default;
+
     // Makes all pixels empty: all channels 0, but depth +infinity, farDepth -infinity, and ids noId. Of the channels
     // beside colour only those in `which` are written. Throws nothing.
     void clear(ChannelMask which = Channels)
@@ -226,8 +232,8 @@ struct TileView : TileHeader {
 
     std::ptrdiff_t stride = 0; // from a row to the next, in pixels; negative where rows lie bottom-up
     const float *color = nullptr, *depth = nullptr, *normal = nullptr, *albedo = nullptr, *position = nullptr;
-    // In place of `color`: premultiplied linear RGBA of 8 bits a channel, level / 255. It is sent as it is, a byte a
-    // channel, and composited exactly.
+    // In place of `color`, which counts if both are set: premultiplied linear RGBA of 8 bits a channel, level / 255. It
+    // is sent as it is, a byte a channel, and composited exactly.
     const std::uint8_t* color8 = nullptr;
     const std::uint32_t *primitiveId = nullptr, *instanceId = nullptr;
     const float* farDepth = nullptr;
