@@ -8,6 +8,8 @@
 #include "output_options.hpp"
 #include "volume_file.hpp"
 
+#include <dfb/version.hpp>
+
 #include <CLI/CLI.hpp>
 
 #include <algorithm>
@@ -47,6 +49,7 @@ public:
     CommandLine()
     {
         app_.set_help_flag("-h,--help", "Print this and exit");
+        app_.set_version_flag("--version", "dfb_render " DFB_VERSION, "Print the version and exit");
         app_.get_formatter()->column_width(36);
         addScene();
         looks_.emplace(app_);
@@ -91,6 +94,8 @@ public:
             options_.given = values(true);
         } catch (const CLI::CallForHelp&) {
             return {std::nullopt, 0, app_.help()};
+        } catch (const CLI::CallForVersion& version) {
+            return {std::nullopt, 0, version.what()};
         } catch (const CLI::ParseError& error) {
             std::string message = error.what();
             const std::string unknown = "INI was not able to parse "; // CLI11 says so of JSON and TOML, too
@@ -461,8 +466,8 @@ private:
     {
         std::vector<std::pair<std::string, std::string>> all;
         for (const CLI::Option* option : app_.get_options()) {
-            if (option->get_positional() || option == app_.get_help_ptr() || option == app_.get_config_ptr()
-                || option->get_name() == "--save-options" || (areGiven && option->count() == 0))
+            if (option->get_positional() || !option->get_configurable() || option->get_name() == "--save-options"
+                || (areGiven && option->count() == 0))
                 continue;
             std::string text = option->count() > 0 ? option->results().back() : option->get_default_str();
             if (isFlag(*option))

@@ -267,8 +267,7 @@ private:
         stats.ranks = ranks;
         stats.scene = o_.scene;
         stats.options = o_.values;
-        stats.version = std::to_string(DFB_VERSION_MAJOR) + '.' + std::to_string(DFB_VERSION_MINOR) + '.'
-                        + std::to_string(DFB_VERSION_PATCH);
+        stats.version = DFB_VERSION;
         stats.transport = transport_;
         stats.mode = o_.mode == Mode::Data ? "data" : o_.mode == Mode::Image ? "image" : "mixed";
         stats.width = o_.width;

@@ -4,6 +4,10 @@
 #define DFB_VERSION_MAJOR 0
 #define DFB_VERSION_MINOR 2
 #define DFB_VERSION_PATCH 0
+#define DFB_TEXT_OF_(number) #number
+#define DFB_TEXT_(number) DFB_TEXT_OF_(number)
+// As text, such as "0.2.0".
+#define DFB_VERSION DFB_TEXT_(DFB_VERSION_MAJOR) "." DFB_TEXT_(DFB_VERSION_MINOR) "." DFB_TEXT_(DFB_VERSION_PATCH)
 
 // Everything stands in an inline namespace named after the version, such as dfb::v0_2. A program writes dfb::Image. If
 // a process contains two versions, for example in two plugins, neither calls the functions of the other. Versions that

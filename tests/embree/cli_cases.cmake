@@ -220,6 +220,10 @@ if(CASE STREQUAL "help")
   if(NOT count LESS 3) # in the list of options, and perhaps in an example
     wrong("expected the help once")
   endif()
+  run(${START} --version)
+  if(NOT code STREQUAL "0" OR NOT out MATCHES "^dfb_render [0-9]+[.][0-9]+[.][0-9]+\n$" OR NOT err STREQUAL "")
+    wrong("expected the version and success")
+  endif()
 
 elseif(CASE STREQUAL "bad_options")
   refuse(${START} "scene|SCENE")

@@ -505,11 +505,6 @@ int dfb_get_report_sized(const dfb_framebuffer* framebuffer, dfb_report* report,
 
 const char* dfb_last_error(void) { return lastError; }
 
-const char* dfb_version(void)
-{
-#define DFB_C_TEXT_OF(number) #number
-#define DFB_C_TEXT(number) DFB_C_TEXT_OF(number)
-    return DFB_C_TEXT(DFB_VERSION_MAJOR) "." DFB_C_TEXT(DFB_VERSION_MINOR) "." DFB_C_TEXT(DFB_VERSION_PATCH);
-}
+const char* dfb_version(void) { return DFB_VERSION; }
 
 } // extern "C"

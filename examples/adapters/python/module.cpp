@@ -141,7 +141,7 @@ PYBIND11_MODULE(_dfb, module)
     if (py::dtype::of<float>().itemsize() != sizeof(float))
         throw py::import_error("dfb was built with a pybind11 that does not understand numpy 2: build it with pybind11 "
                                "2.12 or later, or install numpy<2");
-    module.attr("version") = dfb::detail::printed("%d.%d.%d", DFB_VERSION_MAJOR, DFB_VERSION_MINOR, DFB_VERSION_PATCH);
+    module.attr("version") = DFB_VERSION;
 #if defined(DFB_HAS_MPI)
     module.attr("has_mpi") = true;
     module.attr("mpi_handle_bytes") = sizeof(MPI_Comm);
