@@ -11,6 +11,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
+#include <cstring>
 #include <memory>
 #include <mutex>
 #include <new>
@@ -108,37 +109,11 @@ public:
     }
 
     // A block of at least `byteCount` bytes, not cleared. Throws OutOfMemory.
-    Buffer acquire(std::size_t byteCount)
-    {
-        const int c = classOf(byteCount);
-        SizeClass& sizeClass = classes_[static_cast<std::size_t>(c)];
-        SharedMemory* shared = nullptr;
-        std::byte* block = nullptr;
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            if (!sizeClass.free.empty()) {
-                block = sizeClass.free.back();
-                sizeClass.free.pop_back();
-            } else if (!(block = returned(sizeClass))) {
-                if (++sizeClass.blocks > sizeClass.free.capacity()) // so that giving back never throws
-                    sizeClass.free.reserve(2 * sizeClass.blocks);
-                heldBytes_ += bytesOf(c);
-                shared = bytesOf(c) >= smallestShared ? shared_.get() : nullptr;
-            }
-        }
-        if (!block && shared)
-            block = shared->take(bytesOf(c));
-        try {
-            if (!block)
-                block = static_cast<std::byte*>(::operator new (bytesOf(c), std::align_val_t{alignment}));
-        } catch (const std::bad_alloc&) {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            --sizeClass.blocks;
-            heldBytes_ -= bytesOf(c);
-            throw OutOfMemory(bytesOf(c), "a block");
-        }
-        return Buffer(shared_from_this(), block, byteCount, c);
-    }
+    Buffer acquire(std::size_t byteCount) { return acquire(byteCount, classOf(byteCount)); }
+
+    // A block of smallestShared bytes that begins as zeros and is only ever given out by this function: other processes
+    // may still look there, at any time, after it was given back. Throws OutOfMemory.
+    Buffer acquireGate() { return acquire(smallestShared, gates); }
 
     // Bytes taken from the system so far. The pool gives nothing back before its end, so this is its peak.
     std::uint64_t peakBytes() const noexcept { return heldBytes_; }
@@ -171,19 +146,10 @@ public:
         return buffer.block_.release();
     }
 
-    // Empties `buffer`. If its block is in shared memory, it is never used again: another process may write there at
-    // any time.
-    void retire(Buffer& buffer) noexcept
-    {
-        if (const auto memory = shared(); memory && memory->holds(buffer.data()))
-            buffer.block_.release();
-        buffer = Buffer();
-    }
-
 private:
     static constexpr std::size_t alignment = 64;
     static constexpr std::size_t smallest = 256;
-    static constexpr int classCount = 2 * 48;
+    static constexpr int classCount = 2 * 48, gates = classCount; // gates: a class beside those by size
 
     struct SizeClass {
         std::vector<std::byte*> free;
@@ -195,6 +161,8 @@ private:
 
     static std::size_t bytesOf(int c)
     {
+        if (c == gates)
+            return smallestShared;
         const std::size_t base = smallest << (c / 2);
         return c % 2 ? base + base / 2 : base;
     }
@@ -206,6 +174,40 @@ private:
         if (c == classCount)
             throw OutOfMemory(byteCount, "a block");
         return c;
+    }
+
+    Buffer acquire(std::size_t byteCount, int c)
+    {
+        SizeClass& sizeClass = classes_[static_cast<std::size_t>(c)];
+        SharedMemory* shared = nullptr;
+        std::byte* block = nullptr;
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            if (!sizeClass.free.empty()) {
+                block = sizeClass.free.back();
+                sizeClass.free.pop_back();
+            } else if (!(block = returned(sizeClass))) {
+                if (++sizeClass.blocks > sizeClass.free.capacity()) // so that giving back never throws
+                    sizeClass.free.reserve(2 * sizeClass.blocks);
+                heldBytes_ += bytesOf(c);
+                shared = bytesOf(c) >= smallestShared ? shared_.get() : nullptr;
+            }
+        }
+        const bool isNew = !block;
+        if (isNew && shared)
+            block = shared->take(bytesOf(c));
+        try {
+            if (!block)
+                block = static_cast<std::byte*>(::operator new (bytesOf(c), std::align_val_t{alignment}));
+        } catch (const std::bad_alloc&) {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            --sizeClass.blocks;
+            heldBytes_ -= bytesOf(c);
+            throw OutOfMemory(bytesOf(c), "a block");
+        }
+        if (isNew && c == gates)
+            std::memset(block, 0, bytesOf(c));
+        return Buffer(shared_from_this(), block, byteCount, c);
     }
 
     // A block that was lent and is back, or null. Looks at a few only.
@@ -229,7 +231,7 @@ private:
 
     const bool mayBeShared_;
     mutable std::mutex mutex_;
-    std::array<SizeClass, classCount> classes_;
+    std::array<SizeClass, classCount + 1> classes_;
     std::shared_ptr<SharedMemory> shared_;
     std::atomic<std::uint64_t> heldBytes_{0}; // written under mutex_
 };

@@ -3,7 +3,9 @@
 
 #include <dfb/buffer.hpp>
 
+#include <algorithm>
 #include <atomic>
+#include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <new>
@@ -94,6 +96,22 @@ TEST_CASE("No two threads hold the same block", "[memory]")
         thread.join();
     CHECK(spoilt == 0);
     CHECK(pool->peakBytes() <= 4 * (256 + 384)); // what was held at once, not the sum
+}
+
+TEST_CASE("The block of a gate is zeros at first, and never anything else than a gate's", "[memory]")
+{
+    const auto pool = dfb::MemoryPool::create();
+    const std::byte* gate = nullptr;
+    {
+        dfb::Buffer first = pool->acquireGate();
+        gate = first.data();
+        CHECK(std::all_of(first.data(), first.data() + first.size(), [](std::byte b) { return b == std::byte{}; }));
+        first.data()[5] = std::byte{7};
+    }
+    const dfb::Buffer other = pool->acquire(dfb::MemoryPool::smallestShared), again = pool->acquireGate();
+    CHECK(other.data() != gate);
+    CHECK(again.data() == gate);
+    CHECK(again.data()[5] == std::byte{7}); // another process may be counting there
 }
 
 } // namespace buffer_cases

@@ -68,13 +68,6 @@ public:
                 spareBatches_.push_back(std::make_shared<Batch>());
     }
 
-    // After a failed frame, a task of another rank may still look at the gate.
-    ~FinalGather()
-    {
-        if (imageGate_)
-            pool_->retire(gateMemory_);
-    }
-
     // The image is valid only while imageFrame() >= 0; then imageFrame() is the frame that it shows.
     const Image& image() const noexcept { return image_; }
     std::int64_t imageFrame() const noexcept { return imageFrame_; }
@@ -117,7 +110,7 @@ public:
             if (s == TileState::Received)
                 s = TileState::Old;
         if (imageGate_)
-            imageGate_->open(frame);
+            imageGate_->open(visit(frame));
     }
 
     // ---- an image that other ranks see
@@ -129,7 +122,7 @@ public:
     {
         if (image_.empty())
             return std::nullopt;
-        gateMemory_ = pool_->acquire(std::max(sizeof(ImageGate), MemoryPool::smallestShared));
+        gateMemory_ = pool_->acquireGate();
         const Planes planes = image_.planes();
         ImagePlaces places;
         places.gate = placeOf(gateMemory_.data());
@@ -142,7 +135,7 @@ public:
             gateMemory_ = Buffer();
             return std::nullopt;
         }
-        imageGate_ = new (gateMemory_.data()) ImageGate;
+        imageGate_ = reinterpret_cast<ImageGate*>(gateMemory_.data());
         return places;
     }
 
@@ -191,7 +184,7 @@ public:
                 std::memcpy(to.at[c], from.at[c], copy.pixelCount() * record_.pixelBytes(c));
         for (Buffer& plane : image_.release())
             pool_->lend(plane);
-        pool_->retire(gateMemory_);
+        pool_->lend(gateMemory_);
         imageGate_ = nullptr;
         image_ = std::move(copy);
         ++imageEpoch_;
@@ -213,7 +206,7 @@ public:
         if (isDisplay())
             return inImage(image_.planes(), region);
         if (SharedImage image = remote(); image.gate)
-            if (auto writer = image.gate->enter(frame_)) {
+            if (auto writer = image.gate->enter(visit(frame_))) {
                 place = inImage(image.planes, region);
                 place.writer = std::move(writer);
                 return place;
@@ -424,6 +417,13 @@ public:
     }
 
 private:
+    static_assert(sizeof(ImageGate) <= MemoryPool::smallestShared);
+    // See ImageGate.
+    std::int64_t visit(std::int64_t frame) const noexcept
+    {
+        return static_cast<std::int64_t>(std::uint64_t{address_} << 32 | static_cast<std::uint32_t>(frame));
+    }
+
     // Counts of a rank's tiles and messages to the display rank. Tiles that it has put into the image itself count too.
     struct SentCount {
         std::int32_t tiles = 0, batches = 0;
@@ -650,7 +650,7 @@ private:
     Buffer gateMemory_;
     ImageGate* imageGate_ = nullptr; // in gateMemory_, if other ranks see the image
     std::array<float, 4> background_{}, lastBackground_{};
-    std::vector<float> row_; // of background, as wide as a tile
+    std::vector<float> row_;                    // of background, as wide as a tile
     std::vector<std::atomic<TileState>> state_; // on the display rank
     std::vector<std::int32_t> incomplete_;      // of the last frame
     std::vector<TilesOf> tilesOf_;              // per rank; on the display rank under mutex_

@@ -17,7 +17,8 @@ DFB_NAMESPACE_BEGIN
 namespace detail {
 
 // Lies in shared memory. A writer first counts itself in and then looks whether the gate is open. close() first closes
-// the gate and then looks whether a writer is inside. So at least one of the two sees the other.
+// the gate and then looks whether a writer is inside. So at least one of the two sees the other. The gate of an image
+// that is gone becomes that of another one (MemoryPool::acquireGate()), which lets no writer of the old image in.
 class ImageGate {
     struct Leave {
         void operator()(ImageGate* gate) const noexcept { gate->writers_.fetch_sub(1); }
@@ -27,18 +28,19 @@ public:
     // A writer that is inside until this is destroyed. Null: it was not let in.
     using Writer = std::unique_ptr<ImageGate, Leave>;
 
-    Writer enter(std::int64_t frame) noexcept
+    // `visit`: a frame of an image; not 0, and equal to that of no other frame or image.
+    Writer enter(std::int64_t visit) noexcept
     {
         writers_.fetch_add(1);
         Writer writer(this);
-        return frame_.load() == frame ? std::move(writer) : nullptr;
+        return visit_.load() == visit ? std::move(writer) : nullptr;
     }
 
-    void open(std::int64_t frame) noexcept { frame_.store(frame); } // `frame` is not 0
+    void open(std::int64_t visit) noexcept { visit_.store(visit); }
     // Returns false if a writer does not leave in time; it may have died.
     bool close(std::chrono::milliseconds limit) noexcept
     {
-        frame_.store(0);
+        visit_.store(0);
         const auto end = std::chrono::steady_clock::now() + limit;
         while (writers_.load() != 0) {
             if (std::chrono::steady_clock::now() > end)
@@ -49,7 +51,7 @@ public:
     }
 
 private:
-    std::atomic<std::int64_t> frame_{0};
+    std::atomic<std::int64_t> visit_{0}; // 0: closed
     std::atomic<std::int32_t> writers_{0};
 };
 static_assert(std::atomic<std::int64_t>::is_always_lock_free && std::atomic<std::int32_t>::is_always_lock_free);

@@ -208,6 +208,22 @@ TEST_CASE("After a frame with two owners of a tile the next frame is right", "[s
     CHECK(!isWrong);
 }
 
+TEST_CASE("A change of size leaves no memory behind", "[shared_image]")
+{
+    const Scene s = sceneFor(2, 3);
+    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, scene::configOf(s));
+    dfb::FrameReport report;
+    std::int64_t before = 0;
+    for (int round = 0; round < 110; ++round) {
+        fb.resize(s.width, s.height);
+        if (round % 2 == 0) // also without a frame in between
+            CHECK(goodFrame(fb, s, report));
+        if (round == 10)
+            before = report.peakMemoryBytes;
+    }
+    CHECK(report.peakMemoryBytes < before + 50 * 2048); // had each left a block of the smallest size: 100
+}
+
 TEST_CASE("From an owner that does not leave the image is taken away", "[shared_image]")
 {
     if (sizeOf(MPI_COMM_WORLD) == 1 || !seesNextRank(MPI_COMM_WORLD))
