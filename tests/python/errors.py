@@ -123,13 +123,15 @@ class Errors(unittest.TestCase):
             return lambda thing, rank: thing.render([brick(rank)], CAMERA, draw)
 
         for values, text in (({"rgba": np.zeros((64, 4))}, r"tile.rgba is \(64, 4\): it must be an array \(\d+, \d+, 4\)"),
-                             ({"depth": None}, r"tile.depth is "), ({"rgba": "red"}, "tile.rgba is 'red'")):
+                             ({"depth": None}, r"tile.depth is None: it must be an array"), ({"rgba": "red"}, "tile.rgba is 'red'"),
+                             ({"rgba": [np.ones(4), {}]}, "tile.rgba is a list"),
+                             ({"rgba": np.ma.masked_array(np.ones(4))}, "tile.rgba is a masked array")):
             with self.subTest(text=text):
                 self.assertRegex(str(errors_of(framebuffer, tile_of(**values))[2]), text)
         error = errors_of(framebuffer, lambda thing, rank: thing.render(
             [brick(rank)], CAMERA, lambda _, tile: (tile.rgba, tile.depth)))[1]
         self.assertIn("the renderer returned a tuple: it fills tile.rgba and tile.depth, and returns None", str(error))
-        for result, text in ((None, "the operation's rgba is "), ((1, 2, 3), "a tuple of 3"),
+        for result, text in ((None, "the operation's rgba is None"), ((1, 2, 3), "a tuple of 3"),
                              (np.zeros((3, 3, 4)), r"the operation's rgba is \(3, 3, 4\)")):
             with self.subTest(text=text):
                 error = errors_of(lambda comm: framebuffer(comm, blend=lambda inputs: result),
@@ -156,7 +158,12 @@ class Errors(unittest.TestCase):
             (dict(rgba=rgba, depth=depth, origin=5), "origin is 5: it must be two ints"),
             (dict(rgba=rgba, depth=depth, origin=(2**30, 0)), "farther outside"),
             (dict(rgba=rgba, depth=depth, bottom_up="yes"), "bottom_up is 'yes': it must be a bool"),
-            (dict(rgba=rgba, depth=depth, order="front"), "order is 'front': it must be an int or None"),
+            (dict(rgba=rgba, depth=depth, order="front"), "order is 'front': it must be an int of 32 bits or None"),
+            (dict(rgba=rgba, depth=depth, order=np.float32(1)), "order is 1.0: it must be an int"),
+            (dict(rgba=rgba, depth=depth, order=2**31), "order is 2147483648: it must be an int of 32 bits"),
+            (dict(rgba=rgba, depth=depth, origin=(0, np.float32(0))), "origin is .*: it must be two ints"),
+            (dict(rgba=np.ma.masked_array(rgba), depth=depth), "rgba is a masked array: give its filled.0."),
+            (dict(rgba=rgba, depth=depth, far_depth=float("nan")), "far_depth is not a number"),
         ]
 
         def again(thing, rank):
@@ -185,9 +192,10 @@ class Errors(unittest.TestCase):
         cases = [(([dfb.Brick(1, (0, 0), (1, 1, 1))], CAMERA, fill), "brick.lower is .0, 0.: it must be three floats"),
                  (([dfb.Brick(1, (0, 0, 0), (-1, 1, 1))], CAMERA, fill), "the bounds of brick 1 are not a box"),
                  (([dfb.Brick(-1, (0, 0, 0), (1, 1, 1))], CAMERA, fill), "brick.id is -1"),
+                 (([dfb.Brick(np.float32(1.9), (0, 0, 0), (1, 1, 1))], CAMERA, fill), "brick.id is 1.9"),
                  (([dfb.Brick(5, (0, 0, 0), (1, 1, 1))] * 2, CAMERA, fill), "brick 5 was added twice"),
                  (([Bare()], CAMERA, fill), "AttributeError: .*has no attribute 'lower'"),
-                 ((None, CAMERA, fill), "TypeError: 'NoneType' object is not iterable"),
+                 ((brick(1), CAMERA, fill), "bricks is a Brick: it must be a list"),
                  (([brick(1)], "camera", fill), "the camera is 'camera'"),
                  (([brick(1)], CAMERA, 5), "the renderer is 5")]
         for arguments, text in cases:
@@ -216,7 +224,7 @@ class Errors(unittest.TestCase):
         for arguments, text in ((dict(width=0), "0x93"), (dict(width="wide"), "width is 'wide': it must be an int"),
                                 (dict(blend="mix"), "blend is 'mix'"), (dict(output="png"), "output is 'png'"),
                                 (dict(background=(1, 2)), "background is .1, 2.: it must be four floats"),
-                                (dict(threads=0), "threads is 0"), (dict(timeout=-1), "timeout is -1"),
+                                (dict(width=np.float32(8.7)), "width is 8.7"), (dict(width=np.array(8.7)), "width is array.8.7."), (dict(threads=0), "threads is 0"), (dict(timeout=-1), "timeout is -1"),
                                 (dict(display_rank=7), "7"), (dict(depth=5), "depth is 5: it must be a bool")):
             for kind in (dfb.ImageCompositor, dfb.FrameBuffer):
                 def rank(comm):
@@ -241,9 +249,20 @@ class Errors(unittest.TestCase):
         self.assertRegex(str(error_of(lambda: dfb.MatrixCamera(np.eye(3), np.eye(4)))), r"view is \(3, 3\)")
         self.assertRegex(str(error_of(lambda: dfb.run_ranks(0, print))), "number of ranks is 0")
 
+    def test_an_object_that_cannot_end_does_not_keep_others_open(self):
+        class Busy:
+            def close(self):
+                raise dfb.Error("busy")
+
+        dfb._open[-1] = Busy(), None  # before all others
+        other = dfb.ImageCompositor(None, 8, 8)
+        self.assertEqual(str(error_of(lambda: dfb._end_all(lambda comm: comm is None, False))), "busy")
+        self.assertTrue(other.closed)
+
     def test_wrong_sizes(self):
         for size, text in ((("wide", 5), "the new size is 'wide' x 5: it must be two ints"), ((0, 5), "0x5"),
-                           ((2.5, 5), "the new size is 2.5 x 5")):
+                           ((2.5, 5), "the new size is 2.5 x 5"),
+                           ((np.float32(2.5), 5), "the new size is 2.5 x 5")):
             def again(thing, rank):
                 self.assertEqual((thing.width, thing.height), (WIDTH, HEIGHT))
                 thing.composite(*pixels(rank))

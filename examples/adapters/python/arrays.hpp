@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
@@ -20,6 +21,13 @@
 namespace dfb_python {
 
 inline std::string shapeOf(const py::array& array) { return py::str(array.attr("shape")); }
+
+// Throws InvalidArgument for a masked array, whose mask would be ignored.
+inline void refuseMask(const py::object& array, const char* name)
+{
+    if (py::hasattr(array, "mask"))
+        throw dfb::InvalidArgument(std::string(name) + " is a masked array: give its filled(0)");
+}
 
 // Where the pixels of an array are: rows in which the pixels are contiguous.
 struct ArrayRows {
@@ -60,6 +68,8 @@ public:
         image.hasStraightAlpha = argument<bool>(options, "straight_alpha", "a bool");
         if (!options["far_depth"].is_none())
             image.farDepth = argument<float>(options, "far_depth", "a float or None");
+        if (std::isnan(image.farDepth))
+            throw dfb::InvalidArgument("far_depth is not a number");
         if (rgba.is_none()) {
             if (!depth.is_none())
                 throw dfb::InvalidArgument("depth without rgba");
@@ -69,7 +79,7 @@ public:
         const bool isFloat = isOf<float>(colors);
         if (colors.shape(2) != 4 || !(isFloat || isOf<std::uint8_t>(colors)))
             throw dfb::InvalidArgument("rgba is " + shapeOf(colors) + " of " + shown(colors.dtype())
-                                       + ": it must be (height, width, 4) of uint8 or float32");
+                                       + ": it must be (height, width, 4) of uint8 or float32, in native byte order");
         const auto height = static_cast<int>(colors.shape(0)), width = static_cast<int>(colors.shape(1));
         place(width, height, options, picture);
         if (width == 0 || height == 0)
@@ -95,8 +105,9 @@ private:
     static py::array arrayOf(const py::object& object, const char* name, int dimensions)
     {
         if (!py::isinstance<py::array>(object))
-            throw dfb::InvalidArgument(std::string(name) + " is a " + Py_TYPE(object.ptr())->tp_name
+            throw dfb::InvalidArgument(std::string(name) + " is a " + typeOf(object)
                                        + ": it must be an array of numpy");
+        refuseMask(object, name);
         const auto array = py::reinterpret_borrow<py::array>(object);
         if (array.ndim() != dimensions)
             throw dfb::InvalidArgument(std::string(name) + " has the shape " + shapeOf(array) + ": it must have "
@@ -115,7 +126,7 @@ private:
     {
         std::array<int, 2> origin{0, 0};
         if (!options["origin"].is_none())
-            origin = argument<std::array<int, 2>>(options, "origin", "two ints (x, y), or None");
+            origin = argument<std::array<int, 2>>(options, "origin", "two ints of 32 bits (x, y), or None");
         else if (width != picture.width || height != picture.height)
             throw dfb::InvalidArgument("rgba has " + std::to_string(width) + "x" + std::to_string(height)
                                        + " pixels, the picture " + std::to_string(picture.width) + "x"
@@ -132,7 +143,8 @@ private:
         const py::array depths = arrayOf(depth, "depth", 2);
         if (!isOf<float>(depths) || depths.shape(0) != colors.shape(0) || depths.shape(1) != colors.shape(1))
             throw dfb::InvalidArgument("depth is " + shapeOf(depths) + " of " + shown(depths.dtype()) + " for rgba of "
-                                       + shapeOf(colors) + ": it must be (height, width) of float32");
+                                       + shapeOf(colors)
+                                       + ": it must be (height, width) of float32, in native byte order");
         const ArrayRows own(depths, 1, "depth");
         image.depth = static_cast<const float*>(own.first);
         const std::ptrdiff_t height = depths.shape(0), width = depths.shape(1);

@@ -69,15 +69,12 @@ public:
     {
         const Use use(*this);
         const bool hasArrays = views_->any();
-        py::detail::make_caster<std::array<int, 2>> size;
         std::array<int, 2> to{};
         std::string why; // this rank refuses
         if (hasArrays)
             why = "there are arrays of the image, so it cannot get another size: delete them, or take copies";
-        else if (size.load(py::make_tuple(width, height), true))
-            to = py::detail::cast_op<std::array<int, 2>>(size);
-        else
-            why = "the new size is " + shown(width) + " x " + shown(height) + ": it must be two ints";
+        else if (!toIntegers(py::make_tuple(width, height), to))
+            why = "the new size is " + shown(width) + " x " + shown(height) + ": it must be two ints of 32 bits";
         try {
             withoutGil(*Cause::make(), [&] {
                 refuseTogether(why, "resize()");

@@ -51,7 +51,7 @@ public:
         const std::exception_ptr wrong = caught(*cause, [&] {
             arrays.read(rgba, depth, options, object().config().image);
             if (!options["order"].is_none())
-                place = argument<int>(options, "order", "an int or None");
+                place = argument<int>(options, "order", "an int of 32 bits or None");
             else if (object().blend() == dfb::ImageBlend::InOrder && !rgba.is_none())
                 throw dfb::InvalidArgument("order is None: blend=\"order\" needs this rank's place, 0 in front");
         });

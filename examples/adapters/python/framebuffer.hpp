@@ -177,6 +177,8 @@ public:
         dfb::World world;
         std::optional<AnyCamera> seen;
         const std::exception_ptr wrong = caught(*cause, [&] {
+            if (!py::isinstance<py::iterable>(bricks))
+                throw dfb::InvalidArgument("bricks is a " + typeOf(bricks) + ": it must be a list of bricks");
             for (const py::handle brick : bricks) {
                 world.add(brickOf(brick));
                 objects.push_back(py::reinterpret_borrow<py::object>(brick));
@@ -193,8 +195,7 @@ public:
                 const py::object returned =
                     draw(objects[static_cast<std::size_t>(&brick - world.bricks().data())], given);
                 if (!returned.is_none())
-                    throw dfb::InvalidArgument(std::string("the renderer returned a ")
-                                               + Py_TYPE(returned.ptr())->tp_name
+                    throw dfb::InvalidArgument("the renderer returned a " + typeOf(returned)
                                                + ": it fills tile.rgba and tile.depth, and returns None");
                 given.cast<const PythonTile&>().copyTo(tile);
             });
@@ -218,12 +219,8 @@ private:
     static dfb::Brick brickOf(const py::handle& brick)
     {
         dfb::Brick result;
-        try {
-            result.id = brick.attr("id").cast<std::uint32_t>();
-        } catch (const py::cast_error&) {
-            throw dfb::InvalidArgument("brick.id is " + shown(brick.attr("id"))
-                                       + ": it must be an int, 0 to 2**32 - 1");
-        }
+        if (const py::object id = brick.attr("id"); !toInteger(id, result.id))
+            throw dfb::InvalidArgument("brick.id is " + shown(id) + ": it must be an int, 0 to 2**32 - 1");
         result.bounds = {pointOf(brick.attr("lower"), "brick.lower"), pointOf(brick.attr("upper"), "brick.upper")};
         return result;
     }

@@ -26,6 +26,7 @@ namespace dfb_python {
 
 // Returns an argument as text for an error.
 inline std::string shown(const py::handle& value) { return py::repr(value); }
+inline std::string typeOf(const py::handle& value) { return Py_TYPE(value.ptr())->tp_name; }
 
 // Three numbers. Throws InvalidArgument for anything else.
 inline dfb::Vec3 pointOf(const py::object& value, const std::string& name)
@@ -38,16 +39,50 @@ inline dfb::Vec3 pointOf(const py::object& value, const std::string& name)
     }
 }
 
+// Sets `to` and returns true if `from` is an integer that fits. pybind11 alone would cut the fraction of some numbers
+// of numpy.
+template <class Integer>
+bool toInteger(const py::handle& from, Integer& to)
+{
+    const auto whole = py::reinterpret_steal<py::object>(PyNumber_Index(from.ptr()));
+    if (!whole)
+        PyErr_Clear();
+    py::detail::make_caster<Integer> caster;
+    const bool fits = whole && caster.load(whole, false);
+    if (fits)
+        to = py::detail::cast_op<Integer>(caster);
+    return fits;
+}
+
+// Two integers: (x, y), or a width and a height.
+inline bool toIntegers(const py::handle& from, std::array<int, 2>& to)
+{
+    if (!py::isinstance<py::sequence>(from) || py::len(from) != 2)
+        return false;
+    const auto both = py::reinterpret_borrow<py::sequence>(from);
+    return toInteger(both[0], to[0]) && toInteger(both[1], to[1]);
+}
+
 // The value of an argument. Throws InvalidArgument if it has another type.
 template <class Value>
 Value argument(const py::dict& from, const char* name, const char* kind)
 {
     const py::object value = from[name];
-    py::detail::make_caster<Value> caster;
-    // No conversion to bool, because anything would convert.
-    if (!caster.load(value, !std::is_same_v<Value, bool>))
+    Value result{};
+    bool fits = false;
+    if constexpr (std::is_same_v<Value, int>) {
+        fits = toInteger(value, result);
+    } else if constexpr (std::is_same_v<Value, std::array<int, 2>>) {
+        fits = toIntegers(value, result);
+    } else {
+        py::detail::make_caster<Value> caster;
+        fits = caster.load(value, !std::is_same_v<Value, bool>); // anything would convert to bool
+        if (fits)
+            result = py::detail::cast_op<Value>(std::move(caster));
+    }
+    if (!fits)
         throw dfb::InvalidArgument(std::string(name) + " is " + shown(value) + ": it must be " + kind);
-    return py::detail::cast_op<Value>(std::move(caster));
+    return result;
 }
 
 inline dfb::OutputFormat outputOf(const std::string& name)
@@ -101,8 +136,8 @@ private:
 
     void read(const py::dict& from)
     {
-        config.image.width = argument<int>(from, "width", "an int, in pixels");
-        config.image.height = argument<int>(from, "height", "an int, in pixels");
+        config.image.width = argument<int>(from, "width", "an int of 32 bits, in pixels");
+        config.image.height = argument<int>(from, "height", "an int of 32 bits, in pixels");
         config.image.format = outputOf(argument<std::string>(from, "output", "a str"));
         config.image.depth = argument<bool>(from, "depth", "a bool");
         config.image.displayRank = argument<int>(from, "display_rank", "an int");

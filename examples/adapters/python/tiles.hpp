@@ -41,15 +41,20 @@ using PixelArray = py::array_t<Number, py::array::c_style | py::array::forcecast
 template <class Number>
 PixelArray<Number> pixelsOf(const py::object& object, const dfb::Region& region, int channels, const char* name)
 {
+    refuseMask(object, name);
     auto array = PixelArray<Number>::ensure(object);
+    const bool isArray = array && !object.is_none(); // numpy makes a NaN of None
     std::vector<py::ssize_t> shape{region.height(), region.width()};
     if (channels > 0)
         shape.push_back(channels);
-    const bool fits = array && array.ndim() == static_cast<py::ssize_t>(shape.size())
+    const bool fits = isArray && array.ndim() == static_cast<py::ssize_t>(shape.size())
                       && std::equal(shape.begin(), shape.end(), array.shape());
-    if (!fits)
-        throw dfb::InvalidArgument(std::string(name) + " is " + (array ? shapeOf(array) : shown(object))
-                                   + ": it must be an array " + std::string(py::str(py::tuple(py::cast(shape)))));
+    if (!fits) {
+        const bool isShort = object.is_none() || py::isinstance<py::str>(object);
+        const std::string what = isArray ? shapeOf(array) : isShort ? shown(object) : "a " + typeOf(object);
+        throw dfb::InvalidArgument(std::string(name) + " is " + what + ": it must be an array "
+                                   + std::string(py::str(py::tuple(py::cast(shape)))));
+    }
     if (channels == 4 && py::isinstance<py::array_t<std::uint8_t>>(object)) {
         Number* const levels = array.mutable_data(); // of a copy, as it had another type
         std::transform(levels, levels + array.size(), levels, [](Number level) { return level / 255; });

@@ -33,15 +33,18 @@ _numbers = itertools.count()
 
 
 def _end_all(is_its, leaves):
-    """Ends what is still open of the communicators for which is_its(communicator) holds."""
+    """Ends what is still open of the communicators for which is_its(communicator) holds, also if an end raises."""
+    errors = []
     for number, (impl, comm) in sorted(_open.items()):
         if not is_its(comm):
             continue
         del _open[number]
-        if leaves:
-            impl.leave()
-        else:
-            impl.close()
+        try:
+            impl.leave() if leaves else impl.close()
+        except Error as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]
 
 
 # If an exception has ended the program, perhaps on this rank only, sys.last_type is set.

@@ -69,8 +69,8 @@ class Report:
     def peak_memory_bytes(self) -> int: ...
 
 class Tile:
-    rgba: ArrayLike
-    depth: ArrayLike
+    rgba: NDArray[Any]
+    depth: NDArray[Any]
     @property
     def x0(self) -> int: ...
     @property
