@@ -203,10 +203,11 @@ private:
 
     static const char* messageOf(const TraceEvent& e)
     {
-        static constexpr std::array<const char*, 18> names{
-            "reduction up", "reduction down", "input", "manifest", "manifest taken", "finished tiles",
-            "tiles done",   "abort",          "ask",   "credit",   "ask for jobs",   "jobs",
-            "image place",  "failure",        "ping",  "pong",     "hidden",         "leaving"};
+        static constexpr std::array<const char*, 19> names{
+            "reduction up",   "reduction down", "input",       "manifest", "manifest taken",
+            "finished tiles", "tiles done",     "abort",       "ask",      "credit",
+            "ask for jobs",   "jobs",           "image place", "failure",  "ping",
+            "pong",           "hidden",         "tile lost",   "leaving"};
         static_assert(static_cast<std::size_t>(MessageKind::Leaving) + 1 == names.size());
         return names[std::min<std::size_t>(e.message, names.size() - 1)];
     }

@@ -17,6 +17,7 @@ namespace frame_cases {
 // An operation that fails for one tile if it is told to.
 struct FailsAt {
     int tile = -1;
+    bool inNewFrame = false;
 };
 class FailingBlend : public dfb::BasicAlphaBlend<16> {
 public:
@@ -26,6 +27,8 @@ public:
     {
         BasicAlphaBlend::newFrame(info);
         fails_ = info.tile == data.tile;
+        if (fails_ && data.inNewFrame)
+            throw std::runtime_error("this loop cannot, nor can the operation");
     }
     void finish(dfb::FinishedTile& out)
     {
@@ -72,17 +75,21 @@ struct PartialFrames {
             dfb::NetworkConfig options;
             options.sharedMemory = shared;
             const scene::Scene s = scene::makeScene(5, 3);
+            constexpr int never = 20000, soon = 2000; // ms; even if busy, enough for all that is not lost
             auto config = configOf(s, 2);
+            config.quiet = std::chrono::milliseconds(never);
             using FrameBuffer = dfb::DistributedFrameBuffer<FailingBlend, dfb::NoPixelOp, Transport>;
             FrameBuffer fb(communicator, config, options);
             auto params = paramsOf(s);
             params.allowPartial = true;
             const auto mine = bricksOf(s, fb.rank(), fb.size());
-            // `lost`: the first tile that meets the first brick.
-            int lost = 0;
-            while (!scene::meets(fb, s.bricks[0], lost))
-                ++lost;
-            constexpr int never = 20000, soon = 2000; // ms; even if busy, enough for all that is not lost
+            // The first two tiles that meet the first brick; most owner maps give them to different ranks.
+            std::set<int> two;
+            for (int tile = 0; two.size() < 2; ++tile)
+                if (scene::meets(fb, s.bricks[0], tile))
+                    two.insert(tile);
+            const int lost = *two.begin();
+            const std::set<int> one{lost}, none;
             const dfb::World world(mine);
             dfb::DataParallelLoop loop(fb, world);
             const auto frame = [&](int timeoutMs, const auto& render, const FailsAt& fails) {
@@ -90,7 +97,6 @@ struct PartialFrames {
                 return loop.render(scene::FlatCamera(), render, params, fails);
             };
             const auto renderAll = [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); };
-            const std::set<int> one{lost}, none;
             const auto fails = [&](const dfb::FrameReport& report, dfb::ErrorKind kind, const std::string& text,
                                    const std::set<int>& missing, bool exactly, const std::string& what) {
                 result.expect(report.failure && report.failure->kind == kind
@@ -104,20 +110,37 @@ struct PartialFrames {
                 checkTiles(result, fb, report, s, none, true, what);
             };
             isFine("the first");
-            fails(frame(soon,
+            const auto start = std::chrono::steady_clock::now();
+            fails(frame(never,
                         [&](const dfb::Brick& b, auto& tile) {
-                            if (tile.tile == lost && b.id == s.bricks[0].id)
+                            if (two.count(tile.tile) == 1 && b.id == s.bricks[0].id)
                                 throw std::runtime_error("this renderer cannot");
                             renderBrick(s, b, tile);
                         },
                         {}),
-                  dfb::ErrorKind::UserCode, "this renderer cannot", one, false, "a renderer");
+                  dfb::ErrorKind::UserCode, "this renderer cannot", two, true, "a renderer");
             isFine("after a renderer");
-            const auto start = std::chrono::steady_clock::now();
+            {
+                // Without declarations; the operation cannot begin one of the tiles.
+                auto open = fb.begin(params, {lost, true});
+                const auto tile = std::make_unique<FrameBuffer::Tile>();
+                for (const dfb::Brick& b : mine)
+                    for (const int index : two)
+                        if (b.id == s.bricks[0].id)
+                            open.abort(std::make_exception_ptr(std::runtime_error("this loop cannot")), index);
+                for (int index = 0; index < fb.layout().tileCount(); ++index) {
+                    if (fb.tileOwner(index) == fb.rank())
+                        scene::sendParent(open, *tile, index, scene::bricksIn(fb, s, index));
+                    for (const dfb::Brick& b : mine)
+                        if (scene::meets(fb, b, index) && (two.count(index) == 0 || b.id != s.bricks[0].id))
+                            scene::sendInput(open, *tile, s, b, index);
+                }
+                fails(open.end(), dfb::ErrorKind::UserCode, "this loop cannot", two, true, "a loop");
+            }
             fails(frame(never, renderAll, {lost}), dfb::ErrorKind::UserCode, "this operation cannot", one, true,
                   "an operation");
             result.expect(std::chrono::steady_clock::now() - start < std::chrono::milliseconds(never / 2),
-                          "an operation that fails is waited for");
+                          "a frame waits for what is lost");
             isFine("after an operation");
             {
                 // Inputs that are announced and never come.

@@ -122,12 +122,13 @@ enum class MessageKind : std::uint8_t {
     Ping,          // to be answered at once with a Pong
     Pong,          // the sender is there, and answers whenever it is asked
     Hidden,        // from which generation on inputs of a tile cannot be seen
+    TileLost,      // the sender's renderer has failed in a tile of this owner, in a frame that may be partial
     Leaving        // the sender destroys its object, and takes part in nothing that begins from now on
 };
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb, magicSwapped = 0xfb0d;
-    static constexpr std::uint8_t formatVersion = 13;
+    static constexpr std::uint8_t formatVersion = 14;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;

@@ -235,8 +235,16 @@ public:
 
     void abort(std::int64_t frame, const std::exception_ptr& reason, int tile) override
     {
-        if (const auto inside = open_.enter(frame)) // otherwise the frame is over
-            failTile(reason, tile);
+        const auto inside = open_.enter(frame);
+        if (!inside || !failTile(reason, tile) || failed() || !params_.allowPartial || tile < 0
+            || tile >= layout().tileCount())
+            return; // the frame is over, or fails, or waits for what this rank may still send
+        outcome_->guarded([&] {
+            if (ownerNow(tile) == rank())
+                loseTile(tile);
+            else
+                mailbox_->sendBody(ownerNow(tile), MessageKind::TileLost, frame, static_cast<std::int32_t>(tile));
+        });
     }
 
     bool poll() override
@@ -516,11 +524,12 @@ private:
             failForDamage();
     }
 
-    void failTile(const std::exception_ptr& reason, int tile)
+    // Returns what FrameOutcome::fail() does.
+    bool failTile(const std::exception_ptr& reason, int tile)
     {
         ErrorInfo where;
         where.tile = tile;
-        outcome_->fail(errorInfoOf(reason, where));
+        return outcome_->fail(errorInfoOf(reason, where));
     }
 
     void failForDamage()
@@ -561,6 +570,11 @@ private:
             if (body.word < HiddenTiles::Word::Hides || body.word > HiddenTiles::Word::Shows)
                 failMalformed("word of hidden inputs that there is not", 2, static_cast<std::int64_t>(body.word));
             takeWord(body);
+        } else if (kind == MessageKind::TileLost) {
+            const auto tile = bodyOf<std::int32_t>(message);
+            if (!params_.allowPartial || !pipeline_->table().isMine(tile))
+                failMalformed("a lost tile of another owner, or in a frame that cannot be partial", rank(), tile);
+            loseTile(tile);
         } else if (kind == MessageKind::Manifest) {
             if (!params_.declared)
                 throw Error(errorInfo(ErrorKind::Disagreement,
@@ -645,6 +659,13 @@ private:
         if (arrival.ready)
             outcome_->guarded([&] { submitFinish(static_cast<int>(where.tile)); }, where);
         endReading();
+    }
+
+    // A renderer has failed in a tile of this rank, and has said why.
+    void loseTile(int tile)
+    {
+        if (pipeline_->table().lose(tile))
+            submitFinish(tile);
     }
 
     void endReading()

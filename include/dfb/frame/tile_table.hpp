@@ -152,12 +152,30 @@ public:
         } catch (...) {
             if (const auto& slot = slotOf(h.tile)) {
                 slot->spoilt = arrival.spoilt = true;
-                ++unsaid_; // before declare() can see it
-                arrival.ready =
-                    becomesReady(*slot, slot->counted || !expected_); // else declare() will see it, or nobody waits
+                ++unsaid_;                                                        // before declare() can see it
+                arrival.ready = becomesReady(*slot, slot->counted || !expected_); // as in lose()
             }
             throw;
         }
+    }
+
+    // The tile will not get all of its inputs. Returns true if it still waits for some: then call finish() once, as it
+    // is spoilt. Its error must have been reported. Throws std::bad_alloc.
+    bool lose(int tile)
+    {
+        const std::lock_guard<std::mutex> lock(mutexOf(tile));
+        if (samples(tile).count == 0)
+            return false;
+        try {
+            if (slotFor(tile).ready)
+                return false;
+        } catch (...) { // of the operation, which is not needed
+            if (!slotOf(tile))
+                throw;
+        }
+        Slot& slot = *slotOf(tile);
+        slot.spoilt = true;
+        return becomesReady(slot, slot.counted || !expected_); // else declare() will see it, or nobody waits
     }
 
     // Takes the inputs that each tile will get in each pass; a tile that is not named gets none. First calls

@@ -272,6 +272,12 @@ TEST_CASE("A message that says what cannot be fails its frame on every rank, and
              m.shrink(body + sizeof(dfb::detail::HiddenTiles::Message));
          },
          "word of hidden inputs"},
+        {"a lost tile in a frame that cannot be partial", MessageKind::Manifest, 2,
+         [](dfb::Buffer& m) {
+             put(m, offsetof(MessageHeader, kind), MessageKind::TileLost);
+             m.shrink(body + sizeof(std::int32_t));
+         },
+         "a lost tile of another owner, or in a frame that cannot be partial"},
         {"a finished tile of another owner", MessageKind::FinishedTiles, 1,
          [&](dfb::Buffer& m) { put(m, body + 16, ofOther(dfb::detail::loadAs<std::int32_t>(m.data() + body + 16))); },
          "a finished tile of another owner"},
