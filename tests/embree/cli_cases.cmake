@@ -1068,6 +1068,68 @@ elseif(CASE STREQUAL "shared_memory")
     wrong("${with} messages with shared memory, ${without} without")
   endif()
 
+elseif(CASE STREQUAL "over_mpi")
+  # What ranks that are processes do otherwise than threads: each has its own memory, and the transport is another. All
+  # else is tested with threads, and the transport in tests/frames.
+  file(WRITE ${work}/tetrahedron.obj "${tetrahedron}")
+  file(WRITE ${work}/corners.xyz "2\n\nC 0 9 0\nC 10 0 0\n") # the first brick, which belongs to rank 0, is empty
+  write_volume(some_4x4x4_uint8.raw "some")
+  file(WRITE ${work}/some.nhdr "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 4 16\nencoding: raw\ndata file: some_4x4x4_uint8.raw\n")
+  set(codecs "")
+  if(SNAPPY)
+    set(codecs "demo --bricks 3 --compression snappy" "demo --bricks 3 --compression auto --frames 5")
+  endif()
+  foreach(run "demo --bricks 3 --interleave 3 --deep 8" "demo --bricks 3 --adaptive 0.02 --spp 24 --ao 1"
+      "demo --bricks 2 --blend order" "tetrahedron.obj --bricks 3 --opacity 1 --blend nearest"
+      "demo --bricks 3 --mode mixed --replicate 3 --frames 5 --in-flight 3"
+      "demo --mode image --spp 2 --distribution dynamic --frames 5 --in-flight 3" "synthetic --bricks 6"
+      "demo --bricks 3 --no-shared-memory" "demo --bricks 3 --compression none" ${codecs}
+      "demo --bricks 4 --error-budget 2e-3" "demo --bricks 4 --min-transmittance 0.01"
+      "corners.xyz --bricks 4" "some.nhdr --bricks 3" "demo --size 1x1 --bricks 5")
+    separate_arguments(run)
+    list(POP_FRONT run scene)
+    hash_alone(one ${scene} --size 72x56 ${run})
+    expect_hash(${one} ${START} ${scene} --size 72x56 ${run})
+  endforeach()
+  succeed(${START} demo --size 96x80 --bricks 4 --spp 2 --verify --aux verified)
+  if(NOT out MATCHES "\n0 of [1-9][0-9]+ values of depth and auxiliary channels are wrong")
+    wrong("expected the auxiliary channels to be right")
+  endif()
+  foreach(options "" "--mode mixed --in-flight 2 --no-shared-memory" "--wall 2x1 --output wall_%d.png")
+    separate_arguments(options)
+    succeed(${START} demo --size 80x64 --frames 3 ${options} --stats stats.json --trace trace.json)
+    string(REGEX REPLACE "[a-z]+" "" ranks ${START})
+    check_stats(stats.json ${ranks} 0)
+    execute_process(COMMAND ${CHECK_TRACE} trace.json stats.json WORKING_DIRECTORY ${work} RESULT_VARIABLE code
+      ERROR_VARIABLE err)
+    if(NOT code STREQUAL "0")
+      wrong("trace.json: ${err}")
+    endif()
+  endforeach()
+  field(transport stats.json transport)
+  if(NOT transport STREQUAL "mpi")
+    wrong("expected the transport mpi, got ${transport}")
+  endif()
+  succeed(ranks1 demo --size 96x64 --bricks 5 --output one.png --dither)
+  succeed(${START} demo --size 96x64 --bricks 5 --output same.png --dither --save-options run.json)
+  expect_equal_files(one.png same.png)
+  succeed(${START} --config run.json --output again.png)
+  expect_equal_files(one.png again.png)
+  # What only one rank notices is said once, and ends all.
+  fail(${START} "missing.ply: " tetrahedron.obj missing.ply --size 16x16)
+  fail(${START} "none/x.json: " demo --size 16x16 --output image.png --stats none/x.json)
+  if(EXISTS /dev/full)
+    file(CREATE_LINK /dev/full ${work}/full.json SYMBOLIC)
+    fail(${START} "full.json: cannot be written" demo --size 64x64 --trace full.json)
+  endif()
+  file(MAKE_DIRECTORY ${work}/f_1.1.png) # of rank 1
+  fail(${START} "f_1.1.png: cannot be written" demo --size 64x48 --frames 4 --wall 1x2 --output f_%d.png)
+  file(GLOB later ${work}/f_3*)
+  if(later)
+    wrong("expected no file of the last frame")
+  endif()
+  succeed_with(${START} "nothing was written" demo --size 16x16)
+
 elseif(CASE STREQUAL "modes")
   foreach(scene "demo --bricks 7" "demo --bricks 5 --spp 2" "demo --bricks 7 --camera-distance 0.2 --fov 90"
       "synthetic --bricks 4")

@@ -271,25 +271,21 @@ Scene wallScene()
 TEST_CASE("Every camera sees the same scene, cut or whole", "[cut]")
 {
     const Scene scene = keptDemo(3);
+    example::RenderSettings settings = settingsOf(96, 64);
+    settings.passes = 3;
+    const Picture plain = render(scene, settings, {1, 0});
     for (const auto kind : {example::CameraKind::DepthOfField, example::CameraKind::MotionBlur,
                             example::CameraKind::Stereo, example::CameraKind::Dome}) {
         INFO("camera " << static_cast<int>(kind));
-        example::RenderSettings settings = settingsOf(96, 64);
-        settings.passes = 3;
         settings.view.kind = kind;
         const Picture whole = render(scene, settings, {1, 0});
         CHECK(whole.meanAlpha() > 0.003); // the dome sees it from afar
-        settings.view.kind = example::CameraKind::Perspective;
-        CHECK(largestDifference(render(scene, settings, {1, 0}).rgba, whole.rgba) > 0.1f);
-        settings.view.kind = kind;
-        for (const int bricks : {1, 2, 3, 5}) {
+        CHECK(largestDifference(plain.rgba, whole.rgba) > 0.1f);
+        for (const auto& [bricks, ranks] : {std::pair(2, 3), {5, 7}}) {
             INFO(bricks << " bricks");
             const Picture one = render(scene, settings, {1, bricks});
             checkNoSeams(one, whole);
-            if (bricks != 5)
-                continue;
-            for (const int ranks : {3, 7})
-                checkSame(render(scene, settings, {ranks, bricks}), one);
+            checkSame(render(scene, settings, {ranks, bricks}), one);
         }
     }
 }
@@ -383,7 +379,7 @@ TEST_CASE("Cells that are cut by content tile the bounds, too", "[cut]")
         for (const int count : {1, 2, 3, 7, 8, 17, 64}) {
             INFO(count << " cells");
             example::RenderSettings settings = settingsOf(96, 64);
-            settings.frames = count; // not all of them are looked at
+            settings.frames = count == 17 ? count : std::min(count, 2); // not all of 17 are looked at
             settings.view.distance = count == 7 ? 0.0f : 2.0f;
             const std::vector<Box> cells = cellsOf(scene, settings, count);
             REQUIRE(cells.size() == static_cast<std::size_t>(count));
@@ -423,15 +419,14 @@ TEST_CASE("Bricks that are cut by content take equally long", "[cut]")
     };
     const Scene demo = keptDemo(1);
     for (const Scene* scene : {&std::as_const(scan), &demo})
-        for (const float elevation : {20.0f, -60.0f})
-            for (const int frames : {1, 3}) {
-                INFO((scene == &demo ? "demo" : "scan") << ", elevation " << elevation << ", " << frames << " frames");
-                example::RenderSettings settings = settingsOf(128, 128);
-                settings.frames = frames;
-                settings.view.elevation = elevation;
-                CHECK(busiest(*scene, settings, cellsOf(*scene, settings, 8)) < 1.25);
-                CHECK(busiest(*scene, settings, cutScene(*scene, 8)) > 1.3);
-            }
+        for (const auto& [elevation, frames] : {std::pair(20.0f, 1), {-60.0f, 3}}) {
+            INFO((scene == &demo ? "demo" : "scan") << ", elevation " << elevation << ", " << frames << " frames");
+            example::RenderSettings settings = settingsOf(128, 128);
+            settings.frames = frames;
+            settings.view.elevation = elevation;
+            CHECK(busiest(*scene, settings, cellsOf(*scene, settings, 8)) < 1.25);
+            CHECK(busiest(*scene, settings, cutScene(*scene, 8)) > 1.3);
+        }
     // Surfaces whose hits cast ambient occlusion rays.
     Scene knot;
     knot.add(example::detail::torusKnot(400, 12), true);
@@ -460,11 +455,11 @@ TEST_CASE("Cutting by content leaves no seam", "[cut]")
 
 TEST_CASE("A generated volume has a brick of 64 voxels a side for each cell", "[cut]")
 {
-    for (int count = 1; count <= 17; ++count) {
+    for (const int count : {1, 2, 3, 4, 7, 8, 12}) {
         INFO(count << " cells");
         const Index3 grid = example::nearCubicGrid(count);
         CHECK(grid[0] * grid[1] * grid[2] == count);
-        const Scene scene = keptSynthetic(count);
+        const Scene scene = example::syntheticScene(count, 1);
         for (std::size_t axis = 0; axis < 3; ++axis)
             CHECK(scene.volumes[0].source.info.dims[axis] == 64 * grid[axis]);
         const std::vector<Box> cells = cutScene(scene, count);

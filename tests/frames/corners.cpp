@@ -339,6 +339,8 @@ private:
         std::iota(culprits.begin(), culprits.end(), 0);
         if (fb_.size() > 4)
             culprits = {fb_.size() / 2, fb_.size() - 1};
+        else if (fb_.size() == 3) // rank 1 is as rank 2 of 4, or 3 of 7
+            culprits = {0, 2};
         std::vector<Fault> faults;
         for (const int culprit : culprits)
             for (int kind = 0; kind < Kinds; ++kind)
@@ -730,7 +732,7 @@ struct Corners {
                                             BlendRule::SortByDepth, result, count);
         faults<Accumulated, dfb::NoPixelOp>(connection, {Loop::Data}, BlendRule::SortByDepth, result, count);
         faults<Deep, TrappedPixels<false>>(connection, {Loop::Deep}, BlendRule::SortByDepth, result, count);
-        static const std::map<int, int> expected{{1, 501}, {2, 1046}, {3, 1489}, {4, 1757}, {7, 670}};
+        static const std::map<int, int> expected{{1, 501}, {2, 1046}, {3, 992}, {4, 1757}, {7, 670}};
         const auto found = expected.find(count.ranks);
         result.expect(found != expected.end() && found->second == count.faults,
                       std::to_string(count.faults) + " faults on " + std::to_string(count.ranks) + " ranks");

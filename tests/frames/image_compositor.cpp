@@ -214,31 +214,31 @@ struct Images {
                 config.image.displayRank = ranks - 1;
                 dfb::ImageCompositor compositor(connection, blend, config);
                 result.expect(compositor.image().empty(), "an image before the first");
-                for (const Form& form : forms)
-                    for (const bool toBottomUp : {false, true}) {
-                        compositor.setBottomUp(toBottomUp);
-                        dfb::FrameConfig frame;
-                        frame.background = background;
-                        const int place = blend == dfb::ImageBlend::InOrder ? placeOf(compositor.rank()) : -1;
-                        {
-                            const OwnImage own(compositor.rank(), form, hasDepth);
-                            compositor.start(own.image, place, frame);
-                        } // it is not needed any more
-                        compositor.end();
-                        const auto checkImage = [&] {
-                            if (compositor.isDisplayRank())
-                                check(result, compositor.image(), expected[form.hasStraightAlpha], form, blend,
-                                      toBottomUp);
-                        };
+                for (std::size_t f = 0; f < forms.size(); ++f) {
+                    const Form& form = forms[f];
+                    const bool toBottomUp = (f % 2 == 0) == toBytes;
+                    compositor.setBottomUp(toBottomUp);
+                    dfb::FrameConfig frame;
+                    frame.background = background;
+                    const int place = blend == dfb::ImageBlend::InOrder ? placeOf(compositor.rank()) : -1;
+                    {
+                        const OwnImage own(compositor.rank(), form, hasDepth);
+                        compositor.start(own.image, place, frame);
+                    } // it is not needed any more
+                    compositor.end();
+                    const auto checkImage = [&] {
+                        if (compositor.isDisplayRank())
+                            check(result, compositor.image(), expected[form.hasStraightAlpha], form, blend, toBottomUp);
+                    };
+                    checkImage();
+                    // Memory that stays unchanged: visible to this rank only, or to others as well.
+                    OwnImage own(compositor.rank(), form, hasDepth);
+                    for (const bool isShared : {false, true}) {
+                        const dfb::Buffer memory = isShared ? own.moveTo(compositor) : dfb::Buffer();
+                        compositor.composite(own.image, place, frame);
                         checkImage();
-                        // Memory that stays unchanged: visible to this rank only, or to others as well.
-                        OwnImage own(compositor.rank(), form, hasDepth);
-                        for (const bool isShared : {false, true}) {
-                            const dfb::Buffer memory = isShared ? own.moveTo(compositor) : dfb::Buffer();
-                            compositor.composite(own.image, place, frame);
-                            checkImage();
-                        }
                     }
+                }
             }
         }
         return result;

@@ -19,51 +19,6 @@ using scene::Loop;
 using scene::outcomeOf;
 using scene::Scene;
 
-// A tile operation that throws on one rank, in add or finish.
-struct Faulty : dfb::BasicAlphaBlend<16> {
-    struct FrameData {
-        int rank = -1;
-        bool inAdd = false;
-    };
-    void newFrame(const dfb::TileInfo& info, const FrameData& data)
-    {
-        BasicAlphaBlend::newFrame(info);
-        faulty_ = data.rank == info.rank;
-        inAdd_ = data.inAdd;
-    }
-    void add(dfb::Fragment&& fragment)
-    {
-        if (faulty_ && inAdd_)
-            throw std::runtime_error("the op broke");
-        BasicAlphaBlend::add(std::move(fragment));
-    }
-    void finish(dfb::FinishedTile& out)
-    {
-        if (faulty_ && !inAdd_)
-            throw std::runtime_error("the op broke");
-        BasicAlphaBlend::finish(out);
-    }
-
-private:
-    bool faulty_ = false, inAdd_ = false;
-};
-
-struct FaultyPixelOp {
-    struct FrameData {
-        int rank = -1;
-    };
-    int rank = -1;
-    FrameData data{};
-    void newFrame(const FrameData& d) { data = d; }
-    void process(dfb::PixelTile&) const
-    {
-        if (rank == data.rank)
-            throw std::runtime_error("the pixel op broke");
-    }
-};
-
-using FrameBuffer = dfb::DistributedFrameBuffer<Faulty, FaultyPixelOp>;
-
 // Renders a good frame and returns whether its image is right.
 template <class Fb>
 bool goodFrame(Fb& fb, const Scene& s)
@@ -98,72 +53,6 @@ TEST_CASE("An intercommunicator is refused", "[errors]")
     CHECK((has(text, "InvalidArgument") && has(text, "MPI_Intercomm_merge")));
     MPI_Comm_free(&both);
     MPI_Comm_free(&group);
-}
-
-TEST_CASE("An exception on one rank fails the frame on all", "[errors]")
-{
-    const Scene s = scene::makeScene(9);
-    FrameBuffer fb(MPI_COMM_WORLD, configOf(s), {rankIn(MPI_COMM_WORLD), {}});
-    const dfb::World world(scene::bricksOf(s, fb.rank(), fb.size()));
-    enum class In { Renderer, Add, Finish, PixelOp };
-    for (const int culprit : culprits())
-        for (const In in : {In::Renderer, In::Add, In::Finish, In::PixelOp}) {
-            const std::string text = outcomeOf([&] {
-                dfb::FrameConfig params = scene::paramsOf(s);
-                params.declared = true;
-                auto frame = fb.begin(params, {in == In::Add || in == In::Finish ? culprit : -1, in == In::Add},
-                                      {in == In::PixelOp ? culprit : -1});
-                // Every rank has an input for every tile, so that every rank gets to each place where it may throw.
-                std::vector<dfb::TileInput> inputs;
-                for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
-                    inputs.push_back({tile, static_cast<std::uint32_t>(fb.rank()), 0});
-                frame.declare(inputs);
-                const auto tile = std::make_unique<FrameBuffer::Tile>();
-                for (const dfb::TileInput& input : inputs) {
-                    frame.start(*tile, input.tile);
-                    tile->generation = 1;
-                    try {
-                        if (in == In::Renderer && fb.rank() == culprit && input.tile == 3)
-                            throw std::runtime_error("the renderer broke");
-                    } catch (...) {
-                        frame.abort(std::current_exception());
-                    }
-                    frame.setTile(*tile);
-                }
-                frame.end();
-            });
-            const bool same = sameEverywhere(text);
-            const bool good = goodFrame(fb, s);
-            INFO("rank " << culprit << ", in " << static_cast<int>(in) << ": " << text);
-            CHECK(same);
-            CHECK(has(text, "FrameError: dfb: exception in user code: rank " + std::to_string(culprit)));
-            CHECK(has(text, in == In::Renderer  ? "the renderer broke"
-                            : in == In::PixelOp ? "the pixel op broke"
-                                                : "the op broke"));
-            CHECK(good);
-        }
-}
-
-TEST_CASE("A frame left without end() is cancelled on every rank", "[errors]")
-{
-    const Scene s = scene::makeScene(6);
-    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, configOf(s));
-    for (const int culprit : culprits()) {
-        const std::string text = outcomeOf([&] {
-            if (fb.rank() == culprit) {
-                dfb::FrameConfig params = scene::paramsOf(s);
-                params.declared = true;
-                auto frame = fb.begin(params);
-            } else {
-                scene::renderLoop(fb, s, Loop::Declared);
-            }
-        });
-        const bool good = goodFrame(fb, s);
-        INFO(text);
-        CHECK((fb.rank() == culprit ? text == "fine"
-                                    : has(text, "FrameError: dfb: frame cancelled: rank " + std::to_string(culprit))));
-        CHECK(good);
-    }
 }
 
 TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are named", "[errors]")
