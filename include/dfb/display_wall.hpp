@@ -72,7 +72,8 @@ public:
     // the ranks have not sent all of it, because it failed or was partial, or if a display has dropped it;
     // MalformedMessage if a part of it cannot be right. The displays then keep their picture. Throws TransportError if
     // the connection fails. Throws InvalidArgument, on this rank alone, on a thread that may not call MPI, or for a
-    // frame that is not later than the last or that no rank can have begun.
+    // frame that is not later than the last or that no rank can have begun. A number that is too large by a few is not
+    // noticed: earlier frames can then no longer be finished.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before

@@ -100,8 +100,8 @@ struct FrameConfig {
     int passes = 1;
     // If not null, it has the samples of each tile, by the tile's index, and replaces `passes`; see sampling.hpp. A
     // tile without samples is not rendered, and the image keeps its pixels from the last frame, which must have ended
-    // well. An operation without keepsState begins with sample 0, and may leave tiles out only with framesInFlight 1
-    // and a pixel operation that is pointwise.
+    // well, and with keepsState must have had the same accumulationId. An operation without keepsState begins with
+    // sample 0, and may leave tiles out only with framesInFlight 1 and a pixel operation that is pointwise.
     SamplePlan samples;
     // For an ErrorBudget or HalfLevel: the most inputs that a pixel has in a pass. 0: not known, counts as 65536.
     // ImageParallelLoop, MixedParallelLoop, OrderedLoop and ImageCompositor set it; the other loops do not.
@@ -196,8 +196,8 @@ struct FrameReport : FrameSums {
     // tiles for which the pixel operation threw. All these tiles show the background.
     std::int64_t tilesIncomplete = 0;
     double totalMs = 0;               // begin() to the return of end(), this rank
-    double renderMs = 0;              // begin() to the call of end(), this rank
-    double compositingOverheadMs = 0; // the call of end() to its return, this rank
+    double renderMs = 0;              // begin() to the first call of isDone(), tryEnd() or end(), this rank
+    double compositingOverheadMs = 0; // from that call to the return of end(), this rank
     double renderMsMax = 0;           // all: the longest renderMs
     // This rank: who moved messages: calls of the program (Caller), or a thread of the library (Thread). With
     // InprocTransport the sending thread delivers them, which counts as Thread.

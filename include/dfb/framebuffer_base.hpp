@@ -131,14 +131,15 @@ public:
         engine_->abort(number_, std::make_exception_ptr(reason), -1);
     }
 
-    // Ends the frame. Call it once. Collective; with several framebuffers, in the same order on all ranks. This
-    // rank's last setTile() must have returned: an input that is not sent when all ranks are in end() counts as
-    // missing. Waits until all tiles of all ranks are finished and the display rank has the image, or until the
-    // frame has failed. It fails, too, if nothing is under way that could complete it (ErrorKind::MissingInput).
-    // Throws FrameError, the same on every rank; with FrameConfig::allowPartial it returns instead, with
-    // FrameReport::failure set, unless ranks disagree. Throws TransportError. In all these cases the frame is over;
-    // after a FrameError the next one may begin. Throws InvalidArgument after the frame has ended, and on a thread
-    // that may not call MPI (see Progress), which leaves the frame open.
+    // Ends the frame. Call it once. Collective; with several framebuffers in the same order on all ranks, or in any
+    // order once isDone() or tryEnd() has been called for all of their frames on all ranks. This rank's last setTile()
+    // must have returned: an input that is not sent when all ranks are in end() counts as missing. Waits until all
+    // tiles of all ranks are finished and the display rank has the image, or until the frame has failed. It fails, too,
+    // if nothing is under way that could complete it (ErrorKind::MissingInput). Throws FrameError, the same on every
+    // rank; with FrameConfig::allowPartial it returns instead, with FrameReport::failure set, unless ranks disagree.
+    // Throws TransportError. In all these cases the frame is over; after a FrameError the next one may begin. Throws
+    // InvalidArgument after the frame has ended, and on a thread that may not call MPI (see Progress), which leaves the
+    // frame open.
     FrameReport end();
 
     // Whether end() would return without waiting for other ranks: the frame is complete everywhere, or has failed.
@@ -335,7 +336,7 @@ DFB_COMPILED_ONCE void FrameBase::forEachJob(std::int64_t count, TileHeader* (*t
                 detail::TraceSpan span(fb_->config().trace.get(), TraceEvent::Kind::Tile, number_);
                 guard([&] { job(static_cast<std::int64_t>(i), *tile); }, *tile);
                 if (span.event())
-                    span.event()->tile = static_cast<std::int32_t>(tile->tile);
+                    span.event()->tile = tile->tile;
             }
             keep(tile);
         });

@@ -16,8 +16,8 @@ struct TraceEvent {
     enum class Kind : std::uint8_t {
         // Spans of a frame, reported at its end, even if it failed:
         Frame,   // begin() to the return of end(): FrameReport::totalMs
-        Render,  // begin() to the call of end(): renderMs
-        End,     // the call of end() to its return: compositingOverheadMs
+        Render,  // begin() to the first call of isDone(), tryEnd() or end(): renderMs
+        End,     // from that call to the return of end(): compositingOverheadMs
         Verdict, // from this rank's vote to the verdict of all; byteCount: this rank's part of FrameReport::bytesSent
         // Spans of a thread, which reports them itself. Two spans of a thread are nested, or do not overlap:
         Tile,    // a job of Frame::forEachTile()

@@ -15,6 +15,7 @@
 #include <cstdlib>
 #include <exception>
 #include <fstream>
+#include <locale>
 #include <map>
 #include <mutex>
 #include <new>
@@ -172,20 +173,26 @@ private:
         }
     }
 
-    // Frames that overlap have rows of their own.
+    // Frames that overlap have rows of their own. A part of a frame is in the frame's row, unless it overlaps another
+    // part there.
     static int frameRow(std::vector<std::vector<TraceEvent>>& open, const TraceEvent& e)
     {
-        for (std::size_t row = 0;; ++row) {
-            if (row == open.size())
-                open.emplace_back();
-            std::vector<TraceEvent>& around = open[row];
+        std::size_t row = open.size();
+        for (std::size_t i = open.size(); i-- > 0;) {
+            std::vector<TraceEvent>& around = open[i];
             while (!around.empty() && around.back().end <= e.begin)
                 around.pop_back();
-            if (!around.empty() && (around.back().frame != e.frame || around.back().end < e.end))
-                continue;
-            around.push_back(e);
-            return static_cast<int>(row);
+            if (around.empty()) {
+                row = i;
+            } else if (around.back().frame == e.frame && around.back().end >= e.end) {
+                row = i;
+                break;
+            }
         }
+        if (row == open.size())
+            open.emplace_back();
+        open[row].push_back(e);
+        return static_cast<int>(row);
     }
     static int rowOf(const TraceRecord& r) { return 1000 + r.thread; } // after the rows of frames
 
@@ -229,7 +236,8 @@ private:
 
 } // namespace detail
 
-// One object per rank, for the framebuffers of one connection.
+// One object per rank, for the framebuffers of one connection. Their frames are not told apart: each framebuffer counts
+// its own from 1.
 class TraceFile final : public TraceSink {
 public:
     // Keeps up to `capacity` events, 64 bytes each, in memory that it allocates now. Later events are only counted.
@@ -250,11 +258,11 @@ public:
         ++dropped_;
     }
 
-    // Writes the file on rank 0, and forgets the events, even if that fails. Collective, outside frames, on the thread
-    // that begins frames. Waits for all ranks, without a time-out. `fb`: one of the framebuffers, or an
-    // ImageCompositor. Rank 0 needs memory for the events of all ranks, each other rank for those of one more. Throws
-    // InvalidArgument on all ranks if the file cannot be written; TransportError; and std::bad_alloc on a rank that
-    // lacks memory.
+    // Writes the file on rank 0, with the messages of this call, and forgets the events, even if that fails.
+    // Collective, outside frames, on the thread that begins frames. Waits for all ranks, without a time-out. `fb`: one
+    // of the framebuffers, or an ImageCompositor. Rank 0 needs memory for the events of all ranks, each other rank for
+    // those of one more. Throws InvalidArgument on all ranks if the file cannot be written; TransportError; and
+    // std::bad_alloc on a rank that lacks memory.
     template <class FrameBuffer>
     void write(FrameBuffer& fb, const std::string& path)
     {
@@ -275,6 +283,7 @@ public:
         std::vector<std::byte> failed;
         if (fb.rank() == 0) {
             std::ofstream file(path);
+            file.imbue(std::locale::classic());
             try {
                 writeAll(file, parts);
                 file.flush();

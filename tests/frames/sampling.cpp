@@ -173,7 +173,7 @@ struct Reset {
             first.samples = std::make_shared<const std::vector<dfb::TileSamples>>(
                 static_cast<std::size_t>(fb.layout().tileCount()), dfb::TileSamples{0, 0});
             const std::string outcome = scene::outcomeOf([&] { fb.begin(first).end(); });
-            result.expect(scene::has(outcome, "begin again with sample 0"), "begins with nothing: " + outcome);
+            result.expect(scene::has(outcome, "give each tile samples, from 0 on"), "begins with nothing: " + outcome);
         }
         dfb::AdaptiveSampler sampler(fb.layout(), {0, 2, 4, 2});
         dfb::ImageParallelLoop loop(fb);
@@ -190,7 +190,7 @@ struct Reset {
             result.expect(scene::has(outcome, "FrameConfig::samples"), "the rank was not found: " + outcome);
             if (fb.rank() != 0) {
                 const std::string goingOn = scene::outcomeOf(render);
-                result.expect(scene::has(goingOn, "begin again with sample 0"), "goes on after a failure: " + goingOn);
+                result.expect(scene::has(goingOn, "give each tile samples, from 0 on"), "goes on after a failure: " + goingOn);
                 sampler.reset();
             }
             sampler.reset();

@@ -3,10 +3,15 @@
 
 #include <dfb/trace_file.hpp>
 
+#include <chrono>
 #include <cstddef>
+#include <cstdint>
 #include <cstdio>
 #include <fstream>
 #include <iterator>
+#include <locale>
+#include <map>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -117,6 +122,41 @@ TEST_CASE("A trace file that cannot be written is an error", "[trace]")
     dfb::TraceFile trace(1);
     LoneRank rank;
     CHECK_THROWS_AS(trace.write(rank, "no such folder/trace.json"), dfb::InvalidArgument);
+}
+
+// Groups digits, as the locale of a program with windows may do.
+struct Grouping : std::numpunct<char> {
+    char do_thousands_sep() const override { return ','; }
+    std::string do_grouping() const override { return "\3"; }
+};
+
+TEST_CASE("Parts of a frame are in its row, and numbers are of no locale", "[trace]")
+{
+    using Kind = dfb::TraceEvent::Kind;
+    dfb::TraceFile trace;
+    const auto at = [](int us) { return dfb::TraceEvent::Clock::time_point(std::chrono::microseconds(us)); };
+    const auto add = [&](Kind kind, std::int64_t frame, int begin, int end) {
+        trace.add({kind, 0, at(begin), at(end), frame});
+    };
+    add(Kind::Frame, 7007, 0, 10);
+    add(Kind::Render, 7007, 0, 4);
+    add(Kind::Frame, 7008, 2, 30); // in flight with the other
+    add(Kind::Render, 7008, 2, 12);
+    add(Kind::End, 7008, 12, 30);
+    add(Kind::Verdict, 7008, 14, 28);
+    LoneRank rank;
+    const std::string path = "trace_file_rows.json";
+    const std::locale before = std::locale::global(std::locale(std::locale(), new Grouping));
+    trace.write(rank, path);
+    std::locale::global(before);
+    std::ifstream file(path);
+    std::map<std::string, std::set<std::string>> rows; // of each frame
+    for (std::string line; std::getline(file, line);)
+        if (const auto tid = line.find("\"tid\": "), frame = line.find("\"frame\": "); frame != std::string::npos)
+            rows[line.substr(frame + 9, 4)].insert(line.substr(tid + 7, 1));
+    file.close();
+    std::remove(path.c_str());
+    CHECK(rows == std::map<std::string, std::set<std::string>>{{"7007", {"0"}}, {"7008", {"1"}}});
 }
 
 } // namespace trace_file_cases

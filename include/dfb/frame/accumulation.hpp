@@ -41,8 +41,10 @@ public:
                 failArgument("a tile cannot have %d samples from %d on", t.count, t.first);
             if (traits.keepsState) {
                 if ((t.first > 0 || t.count == 0) && !goesOn)
-                    failArgument("what was accumulated is of no use, as the last frame failed or had another "
-                                 "accumulationId: begin again with sample 0 of each tile");
+                    failArgument(
+                        "tile %td has %d samples from %d on, but what was accumulated is of no use, as the last "
+                        "frame failed or had another accumulationId: give each tile samples, from 0 on",
+                        &t - params.samples->data(), t.count, t.first);
                 continue;
             }
             if (t.first > 0)

@@ -54,7 +54,7 @@ public:
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             if (frame <= last_)
-                failArgument("frame %lld, after the wall has finished frame %lld: frames are finished in order, once, "
+                failArgument("frame %lld, after finish() of frame %lld: frames are finished in order, once, "
                              "and all those of a wall are of one framebuffer, before its resize()",
                              static_cast<long long>(frame), static_cast<long long>(last_));
             if (frame > lastPossible())
