@@ -7,6 +7,12 @@
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
+case ${1:-} in
+-*)
+    echo "usage: sh bench/get_icet.sh [DIR]" >&2
+    exit 2
+    ;;
+esac
 dir=${1:-$root/build/peers/icet}
 dir=${dir%/}
 

@@ -3,6 +3,13 @@
 # exits with 77 if something is missing; otherwise installs it. Sets modules: the folder of the npm packages.
 # shellcheck shell=sh disable=SC2154
 
+case ${1:-} in
+--only-if-installed) ;;
+-*)
+    echo "usage: sh $script [--only-if-installed] [OUTPUT FOLDER]" >&2
+    exit 2
+    ;;
+esac
 modules=${DFB_LIVE_NODE_MODULES:-}
 [ -n "$modules" ] || modules=${XDG_CACHE_HOME:-${HOME:-$root/build}/.cache}/dfb-live
 lacking=
