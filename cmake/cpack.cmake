@@ -25,4 +25,6 @@ if(DFB_WITH_SNAPPY)
 endif()
 list(JOIN _dfb_depends ", " CPACK_DEBIAN_PACKAGE_DEPENDS)
 
+string(REGEX REPLACE "([][+.*()^?|$\\])" "\\\\\\1" _dfb_source "${PROJECT_SOURCE_DIR}")
+set(CPACK_SOURCE_IGNORE_FILES "^${_dfb_source}/(build|[.]git)/")
 include(CPack)

@@ -23,10 +23,14 @@ macro(_dfb_require option packages target)
   endif()
 endmacro()
 
+set(_dfb_system SYSTEM) # no warnings from dfb's headers in another project
+if(_dfb_top_level)
+  set(_dfb_system "")
+endif()
 find_package(Threads REQUIRED)
 _dfb_add_component(core)
 target_compile_features(dfb_core INTERFACE cxx_std_17)
-target_include_directories(dfb_core INTERFACE $<BUILD_INTERFACE:${PROJECT_SOURCE_DIR}/include>)
+target_include_directories(dfb_core ${_dfb_system} INTERFACE $<BUILD_INTERFACE:${PROJECT_SOURCE_DIR}/include>)
 target_compile_definitions(dfb_core INTERFACE DFB_COMPONENTS) # the headers look for no dependency by themselves
 target_link_libraries(dfb_core INTERFACE Threads::Threads)
 
@@ -35,7 +39,7 @@ target_compile_options(dfb_strict_fp INTERFACE
   $<$<COMPILE_LANG_AND_ID:CXX,GNU,Clang,AppleClang,IntelLLVM>:-ffp-contract=off>)
 
 _dfb_add_component(testing)
-target_include_directories(dfb_testing INTERFACE $<BUILD_INTERFACE:${PROJECT_SOURCE_DIR}/tests/include>)
+target_include_directories(dfb_testing ${_dfb_system} INTERFACE $<BUILD_INTERFACE:${PROJECT_SOURCE_DIR}/tests/include>)
 target_link_libraries(dfb_testing INTERFACE dfb_core)
 
 set(DFB_COMPONENTS core)

@@ -66,7 +66,11 @@ private:
     struct GiveBack {
         std::shared_ptr<BlockOwner> owner;
         int sizeClass;
-        void operator()(std::byte* block) const noexcept { owner->giveBack(block, sizeClass); }
+        void operator()(std::byte* block) const noexcept
+        {
+            if (owner) // always, which GCC does not see
+                owner->giveBack(block, sizeClass);
+        }
     };
 
     std::unique_ptr<std::byte, GiveBack> block_;

@@ -32,14 +32,17 @@
 #endif
 
 // Either all files of a program or of a shared library use dfb::compiled, or none. This variable is thread_local in
-// files that do not, and ordinary in dfb::compiled: the linker refuses a mixture. It is hidden, as a library that uses
-// dfb::compiled may be linked with one that does not.
+// files that do not, and ordinary in dfb::compiled, to which files that use it point: the linker refuses a mixture. It
+// is hidden, as a library that uses dfb::compiled may be linked with one that does not.
 #if defined(__GNUC__) && defined(__ELF__)
 extern "C" {
 #if defined(DFB_COMPILING)
 __attribute__((visibility("hidden"))) int dfb_either_all_files_with_dfb_compiled_or_none = 0;
 #elif !defined(DFB_COMPILED)
 __attribute__((used, weak, visibility("hidden"))) thread_local int dfb_either_all_files_with_dfb_compiled_or_none = 0;
+#else
+extern __attribute__((visibility("hidden"))) int dfb_either_all_files_with_dfb_compiled_or_none;
+__attribute__((used)) static int* const dfb_uses_dfb_compiled = &dfb_either_all_files_with_dfb_compiled_or_none;
 #endif
 }
 #endif

@@ -66,40 +66,45 @@ private:
 
 namespace detail {
 
+constexpr std::size_t pixelsOf(int tileSize)
+{
+    return static_cast<std::size_t>(tileSize) * static_cast<std::size_t>(tileSize);
+}
+
 // The array of a channel beside colour; nothing if the tile does not have the channel.
-template <Channel Which, bool isThere, int PixelCount>
+template <Channel Which, bool isThere, std::size_t PixelCount>
 struct Plane {
 };
-template <int PixelCount>
+template <std::size_t PixelCount>
 struct Plane<Depth, true, PixelCount> {
     float depth[PixelCount];
 };
-template <int PixelCount>
+template <std::size_t PixelCount>
 struct Plane<Normal, true, PixelCount> {
     float normal[3 * PixelCount];
 };
-template <int PixelCount>
+template <std::size_t PixelCount>
 struct Plane<Albedo, true, PixelCount> {
     float albedo[3 * PixelCount];
 };
-template <int PixelCount>
+template <std::size_t PixelCount>
 struct Plane<Position, true, PixelCount> {
     float position[3 * PixelCount];
 };
-template <int PixelCount>
+template <std::size_t PixelCount>
 struct Plane<PrimitiveId, true, PixelCount> {
     std::uint32_t primitiveId[PixelCount];
 };
-template <int PixelCount>
+template <std::size_t PixelCount>
 struct Plane<InstanceId, true, PixelCount> {
     std::uint32_t instanceId[PixelCount];
 };
-template <int PixelCount>
+template <std::size_t PixelCount>
 struct Plane<Far, true, PixelCount> {
     float farDepth[PixelCount];
 };
 
-template <ChannelMask Channels, int PixelCount>
+template <ChannelMask Channels, std::size_t PixelCount>
 struct TilePlanes : Plane<Depth, hasChannel(Channels, Depth), PixelCount>,
                     Plane<Normal, hasChannel(Channels, Normal), PixelCount>,
                     Plane<Albedo, hasChannel(Channels, Albedo), PixelCount>,
@@ -148,14 +153,14 @@ struct TilePlanes : Plane<Depth, hasChannel(Channels, Depth), PixelCount>,
 // as the tile has the channels depth[i], normal[3 * i], albedo[3 * i], position[3 * i], primitiveId[i], instanceId[i],
 // farDepth[i]. Pixels outside the region are never read.
 template <ChannelMask Channels, int Size>
-struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
+struct Tile : TileHeader, detail::TilePlanes<Channels, detail::pixelsOf(Size)> {
     static_assert(Size >= 8 && Size <= 256, "dfb: the tile size must be 8 to 256 pixels");
     static_assert(Channels & colorChannel, "dfb: a tile has at least the colour channel");
 
     static constexpr int size = Size;
     static constexpr ChannelMask channels = Channels;
     static constexpr bool hasDepth = (Channels & depthChannel) != 0;
-    using detail::TilePlanes<Channels, Size * Size>::color;
+    using detail::TilePlanes<Channels, detail::pixelsOf(Size)>::color;
 
     Tile() = default;
     // Explicit: a renderer that takes `auto tile` in place of `auto& tile` would fill a copy, and does not compile.

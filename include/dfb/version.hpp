@@ -32,6 +32,10 @@
 #error "dfb needs C++17: compile with -std=c++17"
 #endif
 
+#if (defined(__GNUC__) && !defined(__EXCEPTIONS)) || (defined(__GNUC__) && !defined(__GXX_RTTI))
+#error "dfb needs exceptions and RTTI: compile without -fno-exceptions and -fno-rtti"
+#endif
+
 #if defined(None) || defined(Always)
 #error "dfb: X11 defines None and Always as macros: include dfb before X11, or #undef both in between"
 #endif

@@ -69,7 +69,8 @@ function(_dfb_add_header_test header suffix)
     set(mode "")
   endif()
   add_test(NAME header.${name}
-    COMMAND ${_compile} -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror ${mode} -I${_include} ${ARGN}
+    COMMAND ${_compile} -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wsign-conversion -Wdouble-promotion -Werror
+      ${mode} -I${_include} ${ARGN}
       -include ${header} -include ${header} -x c++ ${CMAKE_CURRENT_SOURCE_DIR}/guards/empty.cpp
     COMMAND_EXPAND_LISTS)
   set_tests_properties(header.${name} PROPERTIES LABELS guard)
@@ -101,6 +102,12 @@ foreach(_component mpi tbb snappy)
     _dfb_add_header_test(dfb/dfb.hpp .with_${_component} -M -DDFB_HAS_${_upper}=1 "${_${_component}_flags}")
   endif()
 endforeach()
+
+# They compile one after another, too.
+list(TRANSFORM _testing_headers REPLACE "(.+)" "-include;\\1" OUTPUT_VARIABLE _include_all)
+add_test(NAME header.testing.all COMMAND ${_compile} -DDFB_COMPILED -I${_include} -I${_testing_include} ${_include_all} -x c++
+  ${CMAKE_CURRENT_SOURCE_DIR}/guards/empty.cpp)
+set_tests_properties(header.testing.all PROPERTIES LABELS guard)
 
 # Without components no header of MPI, oneTBB or Snappy is included, even if they are installed.
 list(TRANSFORM _headers REPLACE "(.+)" "#include <\\1>\n" OUTPUT_VARIABLE _include_all)
@@ -142,14 +149,20 @@ add_test(NAME guard.odr COMMAND sh -c "! \"$1\" -C \"$2\" | grep ' [TDBRC] ' | g
   ${CMAKE_NM} $<TARGET_OBJECTS:test_odr>)
 set_tests_properties(guard.odr PROPERTIES LABELS guard)
 
-# The linker refuses a program of which some files link dfb::compiled and others use the headers alone. It accepts
-# shared libraries that differ in this.
+# The linker refuses a program of which some files link dfb::compiled and others use the headers alone, also if these
+# are in a library that comes first. It accepts shared libraries that differ in this.
 if(NOT DFB_DEVELOP_HEADER_ONLY AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
   add_test(NAME guard.compiled_mixed COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -I${_include}
     ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/headers.cpp ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/compiled.cpp
     $<TARGET_FILE:dfb_compiled> -pthread -o guard_compiled_mixed)
   set_tests_properties(guard.compiled_mixed PROPERTIES LABELS guard
     PASS_REGULAR_EXPRESSION "dfb_either_all_files_with_dfb_compiled_or_none: TLS definition")
+  add_test(NAME guard.compiled_mixed_library
+    COMMAND sh -c "mkdir -p mixed && cd mixed && \"$1\" -std=c++17 -I\"$2\" -c \"$3/headers.cpp\" \"$3/compiled.cpp\" &&
+      ar rcs libheaders.a headers.o && \"$1\" compiled.o libheaders.a \"$4\" -pthread -o mixed" sh
+      ${CMAKE_CXX_COMPILER} ${_include} ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed $<TARGET_FILE:dfb_compiled>)
+  set_tests_properties(guard.compiled_mixed_library PROPERTIES LABELS guard
+    PASS_REGULAR_EXPRESSION "dfb_either_all_files_with_dfb_compiled_or_none.*TLS")
   add_test(NAME guard.compiled_apart
     COMMAND sh -c "\"$@\" -DDFB_COMPILED -DDFB_COMPILING -o apart_compiled.so && \"$@\" -o apart_headers.so &&
       \"$1\" -shared -Wl,--no-as-needed apart_compiled.so apart_headers.so -o apart.so" sh

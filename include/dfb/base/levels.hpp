@@ -417,7 +417,8 @@ inline int ditherSrgb8(float value, double threshold)
         return 255;
     const auto linear = static_cast<double>(value);
     std::size_t below = toSrgb8(linear);
-    below -= linear < light[below] ? 1 : 0;
+    if (linear < light[below])
+        --below;
     const bool isAbove = linear - light[below] > threshold * (light[below + 1] - light[below]);
     return static_cast<int>(below) + (isAbove ? 1 : 0);
 }

@@ -353,9 +353,9 @@ inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<L
     }
     row.clear(x, count);
     for (int i = 0; i < count; ++i) {
-        const Layer* nearest = nullptr;
+        const Layer* nearest = layers.data();
         for (const Layer& layer : layers)
-            if (!nearest || (layer.depth && layer.depth[i] < nearest->depth[i]))
+            if (layer.depth && layer.depth[i] < nearest->depth[i])
                 nearest = &layer;
         const Layer l = nearest->from(i);
         if (l.aux)

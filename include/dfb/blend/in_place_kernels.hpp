@@ -246,7 +246,7 @@ DFB_AVX2 std::uint64_t sortSparseRowsAvx2(const RowInPlace* rows, int layers, in
     __m128 nan = _mm_setzero_ps();
     std::uint64_t active = 0, bit = 1;
     const int step = AtOnce > 1 ? rowsAtOnce : layers;
-    SparseFour fours[AtOnce];
+    SparseFour fours[static_cast<std::size_t>(AtOnce)];
     for (std::ptrdiff_t from = begin; from < end; from += 4 * AtOnce) {
         const int count = static_cast<int>(std::min<std::ptrdiff_t>(AtOnce, (end - from + 3) / 4));
         const auto pixel = [&](int four) { return std::min(from + 4 * four, width - 4); };

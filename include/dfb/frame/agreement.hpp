@@ -234,11 +234,11 @@ inline void checkConfig(const FrameBufferConfig& c, const OperationTraits& opera
     if (w.isHalfLevel && (w.budget > 0 || w.color != WireFormat::Float32))
         failArgument("half a level, and another precision");
     if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f))
-        failArgument("an error budget of %f, colours up to %f", w.budget, w.maxColor);
+        failArgument("an error budget of %f, colours up to %f", w.budget, static_cast<double>(w.maxColor));
     if (w.color == WireFormat::Bytes)
         failArgument("the format bytes is that of inputs of 8 bits, and cannot be asked for");
     if (!(c.minTransmittance >= 0 && c.minTransmittance < 1))
-        failArgument("a least transmittance of %f", c.minTransmittance);
+        failArgument("a least transmittance of %f", static_cast<double>(c.minTransmittance));
 }
 
 // Finds out whether all ranks have the same configuration, which makeMine() returns, and returns what all have.

@@ -243,7 +243,7 @@ public:
             if (ownerNow(tile) == rank())
                 loseTile(tile);
             else
-                mailbox_->sendBody(ownerNow(tile), MessageKind::TileLost, frame, static_cast<std::int32_t>(tile));
+                mailbox_->sendBody(ownerNow(tile), MessageKind::TileLost, frame, std::int32_t{tile});
         });
     }
 

@@ -28,18 +28,20 @@ inline const std::byte* rowOf(const FinishedTile& out, std::size_t channel, int 
 {
     const std::byte* first = out.planes().at[channel];
     const std::size_t pixelBytes =
-        channel == detail::Color ? bytesPerPixel(out.format()) : 4 * detail::channelWords[channel];
+        channel == dfb::detail::Color ? bytesPerPixel(out.format()) : 4 * dfb::detail::channelWords[channel];
     return first ? first + static_cast<std::size_t>(y) * out.stride() * pixelBytes : nullptr;
 }
 inline const float* depthRowOf(const FinishedTile& out, int y)
 {
-    return detail::floatsOf(rowOf(out, detail::Depth, y));
+    return dfb::detail::floatsOf(rowOf(out, dfb::detail::Depth, y));
 }
 inline AuxRow auxRowOf(const FinishedTile& out, int y)
 {
-    return {detail::floatsOf(rowOf(out, detail::Normal, y)), detail::floatsOf(rowOf(out, detail::Albedo, y)),
-            detail::floatsOf(rowOf(out, detail::Position, y)), detail::idsOf(rowOf(out, detail::PrimitiveId, y)),
-            detail::idsOf(rowOf(out, detail::InstanceId, y))};
+    return {dfb::detail::floatsOf(rowOf(out, dfb::detail::Normal, y)),
+            dfb::detail::floatsOf(rowOf(out, dfb::detail::Albedo, y)),
+            dfb::detail::floatsOf(rowOf(out, dfb::detail::Position, y)),
+            dfb::detail::idsOf(rowOf(out, dfb::detail::PrimitiveId, y)),
+            dfb::detail::idsOf(rowOf(out, dfb::detail::InstanceId, y))};
 }
 
 // Collects the reports of all tiles. Any thread may call the members.
@@ -180,7 +182,7 @@ private:
 
     static void addPixel(ErrorReport& report, const FinishedTile& out, int y, std::size_t x, const Pixel& exact)
     {
-        const std::byte* row = rowOf(out, detail::Color, y);
+        const std::byte* row = rowOf(out, dfb::detail::Color, y);
         for (std::size_t c = 0; row && c < 4; ++c) {
             if (out.format() == OutputFormat::RGBA32F) {
                 float value = 0;
