@@ -42,7 +42,10 @@ public:
             std::lock_guard<std::mutex> lock(mutex_);
             tasks_.push(std::move(task));
         }
-        wake();
+        try {
+            wake();
+        } catch (...) { // the task is queued all the same: the next wake(), or a thread that waits, gets it run
+        }
     }
 
     // Runs the oldest waiting task on the calling thread, and returns when it has ended. For threads that have to wait
@@ -98,9 +101,10 @@ public:
     }
 
 protected:
-    // Makes a worker call help() soon.
+    // Makes a worker call help() soon, unless hasWorkers() is false. Any thread calls it, also one that moves messages.
+    // If it throws, a thread that waits for the frame runs the task.
     virtual void wake() = 0;
-    // Calls body(i) for all i on the workers, and waits. The body does not throw.
+    // Calls body(i) for all i on the workers, and waits; the calling thread may take part. The body does not throw.
     virtual void run(std::size_t count, const std::function<void(std::size_t)>& body) = 0;
     // Does so, and calls `meanwhile`, unless it is null, as parallelFor() says.
     virtual void runBeside(std::size_t count, const std::function<void(std::size_t)>& body,

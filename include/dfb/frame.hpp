@@ -191,7 +191,7 @@ struct FrameSums {
 // each rank counted until it entered the verdict. The others are this rank's own.
 struct FrameReport : FrameSums {
     std::int64_t frame = 0;
-    std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why tiles are missing, if any are
+    std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why the frame failed, if it did
     // Tiles that were not finished. On the display rank also finished tiles that have not reached it, and background
     // tiles for which the pixel operation threw. All these tiles show the background.
     std::int64_t tilesIncomplete = 0;

@@ -10,8 +10,11 @@
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
+#include <cstddef>
+#include <functional>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <set>
 #include <stdexcept>
 #include <string>
@@ -168,6 +171,20 @@ TEST_CASE("TbbExecutor", "[executor]")
 }
 #endif
 
+TEST_CASE("A task is queued once, even if no worker can be woken", "[executor]")
+{
+    struct Sleeper final : dfb::Executor {
+        int concurrency() const noexcept override { return 1; }
+        void wake() override { throw std::bad_alloc(); }
+        void run(std::size_t, const std::function<void(std::size_t)>&) override {}
+    } executor;
+    int runs = 0;
+    executor.submit([&] { ++runs; });
+    CHECK(executor.help());
+    CHECK(runs == 1);
+    CHECK(!executor.help());
+}
+
 TEST_CASE("ThreadExecutor has the workers it says, and they work at once", "[executor]")
 {
     CHECK(dfb::ThreadExecutor(3).concurrency() == 3);
@@ -236,7 +253,8 @@ TEST_CASE("A thread that waits for a loop does something else meanwhile", "[exec
 
     calls = 0;
     dfb::CallerExecutor caller;
-    caller.parallelFor(3, [](std::size_t) {}, meanwhile); // takes part
+    caller.parallelFor(
+        3, [](std::size_t) {}, meanwhile); // takes part
     CHECK(calls == 0);
 }
 

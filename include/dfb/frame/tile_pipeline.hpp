@@ -146,7 +146,8 @@ public:
         if (!planes.at[Color])
             return;
         if (std::abs(tile.stride) < tile.valid.width())
-            failArgument("a view of tile %d with rows of %lld pixels", tile.tile, static_cast<long long>(tile.stride));
+            failArgument("a view of tile %d: its stride is %lld, its rows have %d pixels", tile.tile,
+                         static_cast<long long>(tile.stride), tile.valid.width());
         for (std::size_t c = 0; c < channelCount; ++c)
             if (!planes.at[c] && hasChannel(sent_, c))
                 failArgument("a view of tile %d without its %s, which is needed", tile.tile, channelNames[c]);
