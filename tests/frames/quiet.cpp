@@ -89,7 +89,7 @@ struct MissingInputs {
                 for (const Case& c : {Case{"announced", "tile 5: generation 1 has 2 of 3 inputs", 1, false},
                                       Case{"a generation", "tile 5: generation 2 has 0 of 2 inputs", 2, false},
                                       Case{"the first", "tile 5: generation 0 has 0 of 1 inputs", 0, false},
-                                      Case{"declared", "missing source 72 of rank ", 1, true}}) {
+                                      Case{"declared", "missing source 72 declared by rank ", 1, true}}) {
                     const std::string what = std::string(c.name) + (allowPartial ? ", partial" : "") + ", "
                                              + std::to_string(threads) + " threads";
                     dfb::FrameConfig params = paramsOf(s);

@@ -27,15 +27,16 @@ enum Which : std::uint8_t { Verdict, Agreement, Manifest, Reduction, Lender, Bor
 
 Bytes bytesFrom(const std::string& text) { return {fuzz::bytesOf(text), fuzz::bytesOf(text) + text.size()}; }
 
-// Returns whether `call` was refused.
+// Returns whether `call` was refused: as malformed, or with another kind of error that it may have.
 template <class Call>
-bool refused(const Call& call)
+bool refused(const Call& call, dfb::ErrorKind other = dfb::ErrorKind::MalformedMessage)
 {
     try {
         call();
         return false;
     } catch (const dfb::Error& e) {
-        fuzz::require(e.info().kind == dfb::ErrorKind::MalformedMessage, "it is refused as malformed");
+        const dfb::ErrorKind kind = e.info().kind;
+        fuzz::require(kind == dfb::ErrorKind::MalformedMessage || kind == other, "it is refused as malformed");
         return true;
     }
 }
@@ -267,11 +268,13 @@ void jobs(fuzz::Input in)
         const auto what = in.take<std::uint8_t>();
         if (what % 3 == 0) {
             const d::JobRequest request{in.take<std::int64_t>(), in.take<std::int32_t>(), 0};
-            refused([&] {
-                const dfb::JobRange range = server.give(request, 3);
-                fuzz::require(range.begin >= 0 && range.begin <= range.end && range.end <= request.count,
-                              "what is handed out is there");
-            });
+            refused(
+                [&] {
+                    const dfb::JobRange range = server.give(request, 3);
+                    fuzz::require(range.begin >= 0 && range.begin <= range.end && range.end <= request.count,
+                                  "what is handed out is there");
+                },
+                dfb::ErrorKind::Disagreement); // about the number of jobs
         } else if (what % 3 == 1) {
             bool asks = false;
             if (const auto range = worker.take(count, 1, 3, asks))

@@ -37,12 +37,18 @@ public:
         asked_ = exhausted_ = false;
     }
 
-    // On the rank that hands out jobs: returns the next range. Throws Error (MalformedMessage).
+    // On the rank that hands out jobs: returns the next range. Throws Error (MalformedMessage, or Disagreement if
+    // another rank asked for another number of jobs).
     JobRange give(const JobRequest& request, int rankCount)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        if (request.count < 0 || request.workers < 1 || (askedOf_ >= 0 && request.count != askedOf_))
-            failMalformed("a request for jobs that cannot be", askedOf_, request.count);
+        if (request.count < 0 || request.workers < 1)
+            failMalformed("a request for jobs that cannot be", 1,
+                          std::min(request.count, std::int64_t{request.workers}));
+        if (askedOf_ >= 0 && request.count != askedOf_)
+            throw Error(errorInfo(ErrorKind::Disagreement,
+                                  printed("nextJobs() of %lld jobs on one rank and of %lld on another",
+                                          static_cast<long long>(askedOf_), static_cast<long long>(request.count))));
         if (std::exchange(askedOf_, request.count) < 0)
             next_ = fixedPart(request.count);
         const std::int64_t left = request.count - next_;
@@ -136,7 +142,7 @@ public:
         return range.value_or(JobRange{});
     }
 
-    // Throws Error (MalformedMessage).
+    // Throws what JobShare::give() does.
     void receive(int source, const MessageHeader& header, const Buffer& message)
     {
         if (header.kind == MessageKind::JobRequest) {

@@ -294,7 +294,7 @@ public:
                         printed(samples(tile).count > 1 ? "%stile %d pass %d: " : "%stile %d: ", tiles > 1 ? "; " : "",
                                 tile, pass);
                     info.message += m->text();
-                    info.message += listOf("; missing source ", m->inputs);
+                    info.message += listOf("; missing source ", m->inputs, "declared by");
                     info.message += listOf("; announced by source ", m->announcers);
                     info.message += listOf("; here are source ", m->arrived);
                 }
@@ -400,7 +400,8 @@ private:
             tree.declare(inputs);
     }
 
-    static std::string listOf(const char* what, const std::vector<DependencyTracker::Declared>& inputs)
+    static std::string listOf(const char* what, const std::vector<DependencyTracker::Declared>& inputs,
+                              const char* whose = "of")
     {
         constexpr std::size_t most = 8; // each rank sends the text to all others
         std::string text;
@@ -408,7 +409,7 @@ private:
             text += printed("%s%u", i == 0 ? what : ", ", inputs[i].source);
             if (inputs[i].part > 0)
                 text += printed(" part %d", inputs[i].part);
-            text += printed(" of rank %d", inputs[i].rank);
+            text += printed(" %s rank %d", whose, inputs[i].rank);
         }
         if (inputs.size() > most)
             text += printed(" and %zu more", inputs.size() - most);

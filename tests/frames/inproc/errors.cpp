@@ -313,7 +313,7 @@ TEST_CASE("A tile that cannot be right is refused at once, and nothing is sent",
     CHECK(has(texts[10], "-1 children"));
     CHECK(has(texts[10], "tile 3"));
     CHECK(has(texts[16], "without its depth"));
-    CHECK(has(texts[17], "rows of"));
+    CHECK(has(texts[17], "its stride is"));
     CHECK(sentMeanwhile == 0);
     CHECK(wrong == 0);
 }
@@ -343,6 +343,25 @@ TEST_CASE("A tile or a rank that there is not is refused, and nothing comes of i
         CHECK(has(text, "InvalidArgument"));
     CHECK(has(texts[1], "tile 4 of an image of 4 tiles"));
     CHECK(has(texts[3], "rank 2 of 2"));
+}
+
+TEST_CASE("Ranks that call nextJobs() for different numbers of jobs are told so", "[errors]")
+{
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<dfb::ImageParallel> fb(communicator, dfb::FrameBufferConfig(20, 20));
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+            auto frame = fb.begin();
+            for (dfb::JobRange jobs{0, 1}; jobs.begin < jobs.end;)
+                jobs = frame.nextJobs(10 * (fb.rank() + 1));
+            frame.end();
+        });
+    });
+    INFO(joined(texts));
+    CHECK(texts[0] == texts[1]);
+    CHECK(has(texts[0], "ranks disagree"));
+    CHECK((has(texts[0], "nextJobs() of 10 jobs on one rank and of 20 on another")
+           || has(texts[0], "nextJobs() of 20 jobs on one rank and of 10 on another")));
 }
 
 TEST_CASE("Frame parameters that cannot be are refused", "[errors]")

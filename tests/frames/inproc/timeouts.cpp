@@ -335,8 +335,8 @@ TEST_CASE("A declared input that is never sent is named with its source, part an
         CHECK(e.source == 40 + c.culprit);
         CHECK(e.expected == 2 * c.ranks);
         CHECK(e.got == 2 * c.ranks - 1);
-        CHECK(has(e.message,
-                  "missing source " + std::to_string(40 + c.culprit) + " part 2 of rank " + std::to_string(c.culprit)));
+        CHECK(has(e.message, "missing source " + std::to_string(40 + c.culprit) + " part 2 declared by rank "
+                                 + std::to_string(c.culprit)));
         CHECK(r.wrongAfter == 0);
     });
 }
@@ -514,7 +514,7 @@ TEST_CASE("One lost message of each kind: an error in time, on every rank", "[ti
         bool verdictSurvives; // all ranks get the same FrameError, and the next frame is right
     };
     const std::vector<Loss> losses{
-        {"input", MessageKind::Fragment, 0, "of rank", true},
+        {"input", MessageKind::Fragment, 0, "declared by rank", true},
         {"manifest", MessageKind::Manifest, 0, "declared", true},
         {"answer to a manifest", MessageKind::ManifestAck, 0, "declared", true},
         {"finished tiles", MessageKind::FinishedTiles, 0, "finished tiles have not come from rank", true},
@@ -673,7 +673,7 @@ TEST_CASE("Lost credit, or requests for it: setTile() does not wait for ever, an
         CHECK(o.lost);
         CHECK(allSame(textsOf(o.endings)));
         CHECK((o.endings[0].error && o.endings[0].error->kind == dfb::ErrorKind::TimedOut));
-        CHECK(has(o.endings[0].text, "of rank 1"));
+        CHECK(has(o.endings[0].text, "declared by rank 1"));
         CHECK(o.wrong == 0);
     }
 }

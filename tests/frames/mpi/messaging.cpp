@@ -369,7 +369,7 @@ TEST_CASE("What is missing when the time is up is named on every rank, and the n
         CHECK(has(text, "generation 1"));
         CHECK(has(text, declared ? "expected 1, got 0" : "expected 2, got 0"));
         if (declared)
-            CHECK(has(text, "missing source 77 part 3 of rank " + std::to_string(last)));
+            CHECK(has(text, "missing source 77 part 3 declared by rank " + std::to_string(last)));
         else
             CHECK(has(text, "; announced by source " + std::to_string(owner) + " of rank " + std::to_string(owner)));
         CHECK(after == "right");
