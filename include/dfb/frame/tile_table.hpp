@@ -151,9 +151,9 @@ public:
             ++arrived_;
         } catch (...) {
             if (const auto& slot = slotOf(h.tile)) {
-                slot->spoilt = arrival.spoilt = true;
-                ++unsaid_;                                                        // before declare() can see it
-                arrival.ready = becomesReady(*slot, slot->counted || !expected_); // as in lose()
+                ++unsaid_; // before declare() can see it
+                arrival.spoilt = true;
+                arrival.ready = spoil(*slot);
             }
             throw;
         }
@@ -173,9 +173,7 @@ public:
             if (!slotOf(tile))
                 throw;
         }
-        Slot& slot = *slotOf(tile);
-        slot.spoilt = true;
-        return becomesReady(slot, slot.counted || !expected_); // else declare() will see it, or nobody waits
+        return spoil(*slotOf(tile));
     }
 
     // Takes the inputs that each tile will get in each pass; a tile that is not named gets none. First calls
@@ -419,6 +417,13 @@ private:
     static bool allComplete(const Slot& slot)
     {
         return std::all_of(slot.trees.begin(), slot.trees.end(), [](const auto& tree) { return tree.complete(); });
+    }
+
+    // Returns whether to finish the tile now; otherwise declare() will see it, or nobody waits.
+    bool spoil(Slot& slot)
+    {
+        slot.spoilt = true;
+        return becomesReady(slot, slot.counted || !expected_);
     }
 
     static bool becomesReady(Slot& slot, bool now) { return now && !std::exchange(slot.ready, true); }
