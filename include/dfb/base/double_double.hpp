@@ -4,6 +4,8 @@
 #include <dfb/version.hpp>
 
 #include <cmath>
+#include <cstdint>
+#include <cstring>
 
 DFB_NAMESPACE_BEGIN
 namespace detail {
@@ -15,6 +17,24 @@ struct DoubleDouble {
     {
         const double s = a + b, part = s - a;
         return {s, (a - (s - part)) + (b - part)};
+    }
+    // The same where b is no larger than a, or 0.
+    static DoubleDouble sumOfOrdered(double a, double b) noexcept
+    {
+        const double s = a + b;
+        return {s, b - (s - a)};
+    }
+    // A float has 24 bits, so its products with the halves of `a` are exact. This needs no fused multiply-add, which
+    // some processors lack.
+    static DoubleDouble product(double a, float b) noexcept
+    {
+        std::uint64_t bits = 0;
+        std::memcpy(&bits, &a, sizeof bits);
+        bits &= ~std::uint64_t{0x7ffffff};
+        double head = 0;
+        std::memcpy(&head, &bits, sizeof head);
+        const double p = a * static_cast<double>(b);
+        return {p, (head * static_cast<double>(b) - p) + (a - head) * static_cast<double>(b)};
     }
     static DoubleDouble product(double a, double b) noexcept
     {

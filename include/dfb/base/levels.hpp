@@ -40,12 +40,12 @@ inline std::uint8_t toUnorm8(const DoubleDouble& value) noexcept
         return 0;
     if (value.high >= 1.0 && value.high + value.low >= 1.0)
         return 255;
-    const DoubleDouble scaled = value * DoubleDouble{255.0, 0.0};
+    const DoubleDouble scaled = DoubleDouble::product(value.high, 255.0f);
     const int below = static_cast<int>(scaled.high);
-    const DoubleDouble overTie = scaled + DoubleDouble{-below - 0.5, 0.0};
-    if (std::abs(overTie.high) <= 0x1p-90)
+    const double overTie = (scaled.high - (below + 0.5)) + (scaled.low + 255.0 * value.low);
+    if (std::abs(overTie) <= 0x1p-90)
         return static_cast<std::uint8_t>(below + below % 2);
-    return static_cast<std::uint8_t>(below + (overTie.high > 0 ? 1 : 0));
+    return static_cast<std::uint8_t>(below + (overTie > 0 ? 1 : 0));
 }
 
 // The linear value at which sRGB reaches so many half levels, to about 100 bits.
@@ -142,7 +142,10 @@ inline std::uint8_t toSrgb8(double linear) noexcept
 // The sRGB level of a value that is known to about 100 bits.
 inline std::uint8_t toSrgb8(const DoubleDouble& linear) noexcept
 {
-    int level = toSrgb8(linear.high);
+    bool isNear = false;
+    int level = srgbCells().levelOf(linear.high, isNear);
+    if (!isNear)
+        return static_cast<std::uint8_t>(level);
     const auto isAbove = [&](int k) { // the boundary after level k
         const DoubleDouble boundary = srgbBoundary(k);
         return (linear + DoubleDouble{-boundary.high, -boundary.low}).high >= 0;

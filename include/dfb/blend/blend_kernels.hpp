@@ -8,6 +8,7 @@
 #pragma once
 
 #include <dfb/base/cpu.hpp>
+#include <dfb/base/double_double.hpp>
 
 #include <algorithm>
 #include <cstddef>
@@ -359,6 +360,36 @@ DFB_AVX2 inline void blendLevelsAvx2(std::uint8_t* levels, int count, const std:
 
 #endif
 
+// ---- in twice the precision of double
+
+// The pixels of a row, with the low words of all sums.
+struct ExactPixels {
+    double *rgba, *rgbaLow, *transmittance, *transmittanceLow;
+};
+
+// Blends pixels under those of `row`, and lowers the transmittance. The colours are `stride` floats apart: 4, or 0 for
+// one colour everywhere.
+DFB_INLINE void blendExactlyPlain(const ExactPixels& row, int count, const float* color, int stride)
+{
+    const auto add = [](double& high, double& low, double product, double rest) {
+        const DoubleDouble sum = DoubleDouble::sum(high, product);
+        const DoubleDouble result = DoubleDouble::sumOfOrdered(sum.high, sum.low + (low + rest));
+        high = result.high;
+        low = result.low;
+    };
+    for (int i = 0; i < count; ++i, color += stride) {
+        double product[4], rest[4];
+        for (int c = 0; c < 4; ++c) {
+            const DoubleDouble p = DoubleDouble::product(row.transmittance[i], color[c]);
+            product[c] = p.high;
+            rest[c] = p.low + row.transmittanceLow[i] * static_cast<double>(color[c]);
+        }
+        for (int c = 0; c < 4; ++c)
+            add(row.rgba[4 * i + c], row.rgbaLow[4 * i + c], product[c], rest[c]);
+        add(row.transmittance[i], row.transmittanceLow[i], -product[3], -rest[3]);
+    }
+}
+
 // ---- the faster one
 
 inline void takeLayer(double* rgba, double* transmittance, int count, const float* color, double minTransmittance)
@@ -392,6 +423,11 @@ inline void blendConstant(double* rgba, const double* transmittance, int count, 
 inline void takeNearest(float* nearest, int count, const float* color, const float* depth)
 {
     fastest<takeNearestPlain>(nearest, count, color, depth);
+}
+
+inline void blendExactly(const ExactPixels& row, int count, const float* color, int stride)
+{
+    fastest<blendExactlyPlain>(row, count, color, stride);
 }
 
 inline void blendLevels(std::uint8_t* levels, int count, const std::uint8_t* layer)

@@ -10,7 +10,6 @@
 // is added as it stands, also where alpha is 0.
 #pragma once
 
-#include <dfb/base/double_double.hpp>
 #include <dfb/blend/blend_kernels.hpp>
 #include <dfb/blend/composite_row.hpp>
 #include <dfb/blend/sort_kernels.hpp>
@@ -26,19 +25,16 @@ DFB_NAMESPACE_BEGIN
 
 namespace detail {
 
-// Blends `rgba` under a pixel of a row, in twice the precision, and lowers the pixel's transmittance.
-inline void overExactly(CompositeRow& row, std::size_t x, const float* rgba)
+// Blends colours that are `stride` floats apart under pixels of a row, in twice the precision. Returns false if the row
+// has no low words, and leaves it as it is.
+inline bool overExactly(CompositeRow& row, int x, int count, const float* color, int stride)
 {
-    DoubleDouble t{row.transmittance[x], row.transmittanceLow[x]};
-    for (std::size_t c = 4 * x; c < 4 * x + 4; ++c) {
-        const DoubleDouble sum =
-            DoubleDouble{row.rgba[c], row.rgbaLow[c]} + t * DoubleDouble{static_cast<double>(rgba[c - 4 * x]), 0};
-        row.rgba[c] = sum.high;
-        row.rgbaLow[c] = sum.low;
-    }
-    t = t * DoubleDouble::sum(1.0, -static_cast<double>(rgba[3]));
-    row.transmittance[x] = t.high;
-    row.transmittanceLow[x] = t.low;
+    const auto at = static_cast<std::size_t>(x);
+    if (!row.rgbaLow.empty())
+        blendExactly({row.rgba.data() + 4 * at, row.rgbaLow.data() + 4 * at, row.transmittance.data() + at,
+                      row.transmittanceLow.data() + at},
+                     count, color, stride);
+    return !row.rgbaLow.empty();
 }
 
 } // namespace detail
@@ -46,13 +42,11 @@ inline void overExactly(CompositeRow& row, std::size_t x, const float* rgba)
 // Composites `count` pixels of a layer under the pixels [x, x + count) of `row`.
 inline void over(CompositeRow& row, int x, int count, const Layer& layer)
 {
-    const bool exactly = !row.rgbaLow.empty();
-    for (int i = 0; exactly && i < count; ++i)
-        detail::overExactly(row, static_cast<std::size_t>(x + i), layer.color + 4 * i);
+    const bool isDone = detail::overExactly(row, x, count, layer.color, 4);
     double* acc = row.rgba.data() + 4 * static_cast<std::size_t>(x);
     double* transmittance = row.transmittance.data() + x;
     const float* c = layer.color;
-    for (int i = 0; !exactly && i < count; ++i, acc += 4, c += 4) {
+    for (int i = 0; !isDone && i < count; ++i, acc += 4, c += 4) {
         const double t = transmittance[i];
         acc[0] += t * static_cast<double>(c[0]);
         acc[1] += t * static_cast<double>(c[1]);
@@ -131,9 +125,7 @@ inline void overBackground(CompositeRow& row, int begin, int count, const float*
         row.aux.weight[x] = row.rgba[4 * x + 3];
     if (rgba[0] == 0.0f && rgba[1] == 0.0f && rgba[2] == 0.0f && rgba[3] == 0.0f)
         return;
-    for (std::size_t x = first; x < end && !row.rgbaLow.empty(); ++x)
-        detail::overExactly(row, x, rgba);
-    if (row.rgbaLow.empty())
+    if (!detail::overExactly(row, begin, count, rgba, 0))
         detail::blendConstant(row.rgba.data() + 4 * first, row.transmittance.data() + first, count, rgba);
 }
 

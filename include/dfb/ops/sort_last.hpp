@@ -520,8 +520,8 @@ DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, dou
         return;
     Scratch& scratch = FragmentStore::scratch();
     CompositeRow& row = scratch.exactRow;
-    std::vector<DoubleDouble>& sum = scratch.exactSum; // over the passes
-    sum.assign(4 * static_cast<std::size_t>(out.width()), {});
+    std::vector<DoubleDouble>& sum = scratch.exactSum; // over the passes, if there are several
+    sum.assign(info_.passes > 1 ? 4 * static_cast<std::size_t>(out.width()) : 0, {});
     forEachPass(scratch.pointers, [&](std::size_t, auto begin, auto end) {
         scratch.exactCompositor.start(rule(), begin, end, false);
         scratch.exactCompositor.skipRows(y);
@@ -533,7 +533,8 @@ DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, dou
     });
     const int step = out.isDithered() ? 4 : 1; // with dithering, only alpha is rounded again
     for (int i = step - 1; i < 4 * out.width(); i += step) {
-        const DoubleDouble value = sum[static_cast<std::size_t>(i)] / info_.passes;
+        const auto at = static_cast<std::size_t>(i);
+        const DoubleDouble value = sum.empty() ? DoubleDouble{row.rgba[at], row.rgbaLow[at]} : sum[at] / info_.passes;
         if (std::isfinite(value.high)) // twice the precision makes NaN of infinities
             out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
     }

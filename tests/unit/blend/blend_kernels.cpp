@@ -197,6 +197,61 @@ TEST_CASE("A constant under pixels, and the nearest depths: by hand as in plain 
     CHECK(different == 0);
 }
 
+TEST_CASE("In twice the precision layers blend as sums and products of pairs of doubles do", "[kernels]")
+{
+    using d::DoubleDouble;
+    Random random(21);
+    int different = 0;
+    double farthest = 0;
+    for (int round = 0; round < repeats(300); ++round) {
+        const int width = anyCount(random);
+        const bool isExact = round % 2 == 0; // 11 factors of 8 bits: a pair of doubles has room for all digits
+        const auto at = [](int i) { return static_cast<std::size_t>(i); };
+        std::vector<DoubleDouble> rgba(4 * at(width)), through(at(width), DoubleDouble{1, 0});
+        dfb::CompositeRow row;
+        row.resize(width, 0, true);
+        row.clear(0, width);
+        for (int layer = 0; layer < 11; ++layer) {
+            const bool isConstant = layer == 10;
+            std::vector<float> colors(4 * at(isConstant ? 1 : width));
+            for (float& value : colors)
+                value = isExact ? static_cast<float>(below(random, 257)) / 256 : uniform(random);
+            if (isConstant)
+                dfb::overBackground(row, 0, width, colors.data());
+            else
+                dfb::over(row, 0, width, {colors.data(), nullptr, nullptr});
+            for (int i = 0; i < width; ++i) {
+                const float* color = colors.data() + (isConstant ? 0 : 4 * i);
+                for (int c = 0; c < 4; ++c)
+                    rgba[at(4 * i + c)] =
+                        rgba[at(4 * i + c)] + through[at(i)] * DoubleDouble{static_cast<double>(color[c]), 0};
+                through[at(i)] = through[at(i)] * DoubleDouble::sum(1, -static_cast<double>(color[3]));
+            }
+        }
+        const auto check = [&](const DoubleDouble& expected, double high, double low) {
+            const double off = std::abs((high - expected.high) + (low - expected.low));
+            different += isExact ? off != 0 : !(off < 0x1p-96);
+            farthest = std::max(farthest, off);
+        };
+        for (std::size_t i = 0; i < rgba.size(); ++i)
+            check(rgba[i], row.rgba[i], row.rgbaLow[i]);
+        for (std::size_t i = 0; i < through.size(); ++i)
+            check(through[i], row.transmittance[i], row.transmittanceLow[i]);
+        dfb::CompositeRow plain = row, fast = row;
+        const float color[] = {0.1f, 0.2f, 0.7f, 0.3f};
+        const auto pixels = [](dfb::CompositeRow& r) {
+            return d::ExactPixels{r.rgba.data(), r.rgbaLow.data(), r.transmittance.data(), r.transmittanceLow.data()};
+        };
+        d::blendExactlyPlain(pixels(plain), width, color, 0);
+        d::blendExactly(pixels(fast), width, color, 0);
+        different += !isSame(plain.rgba, fast.rgba) || !isSame(plain.rgbaLow, fast.rgbaLow)
+                     || !isSame(plain.transmittance, fast.transmittance)
+                     || !isSame(plain.transmittanceLow, fast.transmittanceLow);
+    }
+    INFO("off by up to " << farthest);
+    CHECK(different == 0);
+}
+
 TEST_CASE("A layer of levels under another is rounded to the nearest, by hand as in plain C++", "[kernels]")
 {
     Random random(5);
