@@ -1,5 +1,5 @@
-// Buffer: a block of 64-byte aligned memory with one owner. MemoryPool: where blocks come from, with the high-water
-// mark of all it ever held.
+// Buffer: a block of 64-byte aligned memory with one owner. MemoryPool: gives out blocks, uses them again, and knows
+// its peak.
 #pragma once
 
 #include <dfb/base/fifo.hpp>
@@ -23,7 +23,7 @@ DFB_NAMESPACE_BEGIN
 // There is not enough memory. what() says how many bytes were asked for, and for which use.
 class OutOfMemory final : public std::bad_alloc {
 public:
-    // No more than 150 characters of the purpose are kept: there may be no memory for a text either.
+    // Keeps at most 150 characters of the purpose, in the object itself: there may be no memory for a text.
     OutOfMemory(std::size_t byteCount, const char* purpose) noexcept
     {
         std::snprintf(text_, sizeof text_, "no memory for %zu bytes: %.150s", byteCount, purpose);
@@ -77,8 +77,8 @@ private:
     std::size_t size_ = 0;
 };
 
-// Memory that other processes see as well. A pool may take its blocks from it. See comm/node_memory.hpp. All members
-// may be called from any thread.
+// Memory that other processes see, too. A pool may take its blocks from it. See comm/node_memory.hpp. All members may
+// be called from any thread.
 class SharedMemory {
 public:
     // A block that is never given back, 64-byte aligned; null if there is no more.
@@ -115,11 +115,11 @@ public:
     // A block of at least `byteCount` bytes, not cleared. Throws OutOfMemory.
     Buffer acquire(std::size_t byteCount) { return acquire(byteCount, classOf(byteCount)); }
 
-    // A block of smallestShared bytes that begins as zeros and is only ever given out by this function: other processes
-    // may still look there, at any time, after it was given back. Throws OutOfMemory.
+    // A block of smallestShared bytes, zeros when it is first given out. Only this function gives it out again, because
+    // other processes may still read it after it was given back. Throws OutOfMemory.
     Buffer acquireGate() { return acquire(smallestShared, gates); }
 
-    // Bytes taken from the system so far. The pool gives nothing back before its end, so this is its peak.
+    // Bytes taken from the system so far. This is the peak, as the pool gives nothing back before its end.
     std::uint64_t peakBytes() const noexcept { return heldBytes_; }
 
     bool mayBeShared() const noexcept { return mayBeShared_; }

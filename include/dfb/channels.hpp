@@ -28,17 +28,17 @@ inline constexpr ChannelMask depthChannel = 2;
 //
 // Position and ids are those of the front input: the first input with alpha > 0 in the order of blending, which is that
 // of (depth, source, part), or the one given to OrderedBlend. An id comes from the first such input that has one. With
-// several passes, they are those of the pass with the nearest front input; among equally near ones, or without depths,
-// of the first. To compare passes, depth is sent even if the image has none. With one pass it is sent only if the
-// operation needs it.
+// several passes, they are those of the pass with the nearest front input; of equally near ones, or without depths,
+// those of the first. To compare passes, depth is sent even if the image has none. With one pass it is sent only if the
+// operation needs it or the image has it.
 inline constexpr ChannelMask normalChannel =
     4; // 3 floats times alpha: over; comes out shorter than 1 where normals differ
 inline constexpr ChannelMask albedoChannel = 8;       // 3 floats times alpha: over
 inline constexpr ChannelMask positionChannel = 16;    // 3 floats, not premultiplied: of the front input; else 0
 inline constexpr ChannelMask primitiveIdChannel = 32; // 1 unsigned: of the front input that has one; else noId
 inline constexpr ChannelMask instanceIdChannel = 64;  // the same
-// 1 float: how far back the input reaches, in the units of depth. The interval [depth, far] holds all that was blended
-// into the pixel. It is compared, never blended, and not part of an image.
+// 1 float: how far back the input reaches, in the units of depth. All that was blended into the pixel is in [depth,
+// far]. It is compared, never blended, and not part of an image.
 inline constexpr ChannelMask farChannel = 128;
 
 // The channels that an image can have beside colour and depth.

@@ -1,6 +1,5 @@
-// Where the functions of dfb are compiled: in each source file that uses them, which is the default, or once, in the
-// target dfb::compiled, which defines DFB_COMPILED for all that link it. A function that is compiled once stands in its
-// header as
+// By default each source file compiles the functions of dfb that it uses. The target dfb::compiled compiles them once,
+// and defines DFB_COMPILED for all that link it. A function that can be compiled once stands in its header as
 //
 //   DFB_COMPILED_ONCE void f();
 //
@@ -31,9 +30,10 @@
 #define DFB_COMPILED_TEMPLATE(...) static_assert(true)
 #endif
 
-// Either all files of a program or of a shared library use dfb::compiled, or none. This variable is thread_local in
-// files that do not, and ordinary in dfb::compiled, to which files that use it point: the linker refuses a mixture. It
-// is hidden, as a library that uses dfb::compiled may be linked with one that does not.
+// Either all files of a program or of a shared library use dfb::compiled, or none. Files that do not use it have this
+// variable as thread_local. dfb::compiled has it as an ordinary one, to which the files that use it point. So the
+// linker refuses a mixture. The variable is hidden: a library that uses dfb::compiled may be linked with one that does
+// not.
 #if defined(__GNUC__) && defined(__ELF__)
 extern "C" {
 #if defined(DFB_COMPILING)

@@ -1,9 +1,9 @@
-// DependencyTracker: the dependency tree of one tile and pass (section 3.1.1 of the paper): which inputs have arrived,
-// which are missing, and every way in which inputs can contradict each other.
+// DependencyTracker: the dependency tree of one tile and pass (section 3.1.1 of the paper). It knows which inputs have
+// arrived and which are missing, and finds every contradiction between inputs.
 //
-// An input is a member of a generation and announces children in the next; the sum over generation g is the size of
-// generation g + 1. Generation 0 has `rootCount` members. Inputs arrive in any order. The tree is complete when every
-// announced input has arrived. One thread at a time may use it.
+// An input is a member of a generation and announces a number of children in the next. The sum of these numbers over
+// generation g is the size of generation g + 1. Generation 0 has `rootCount` members. Inputs arrive in any order. The
+// tree is complete when every announced input has arrived. One thread at a time may use it.
 #pragma once
 
 #include <dfb/error.hpp>
@@ -42,9 +42,10 @@ public:
         int rank = -1;
     };
 
-    // Declares generation 1: it will have exactly these (source, part) pairs, each once. For frames in which ranks send
-    // manifests. Call it once, in place of arrive() for the input of generation 0. `Inputs`: a range of Declared, or of
-    // structs with these members. Throws as arrive() does, also if an input came before that was not declared.
+    // Declares generation 1: it will have exactly these (source, part) pairs, each once. For frames with
+    // FrameConfig::declared. Call it once, in place of arrive() for the input of generation 0. `Inputs`: a range of
+    // Declared, or of structs with these members. Throws as arrive() does, also if an input that was not declared has
+    // come already.
     template <class Inputs>
     void declare(const Inputs& inputs)
     {
@@ -67,10 +68,10 @@ public:
         advance();
     }
 
-    // Takes note of one input. Throws Error, naming generation, source, expected and got, for: a negative number
-    // of children, a duplicate (generation, source, part), more inputs than announced, and an input of a
-    // generation or source that nobody announced. After a throw the tree is of no further use until reset(). `rank`:
-    // the rank that it comes from, if that is known, for the text of errors.
+    // Takes note of one input. Throws Error, with generation, source, expected and got, for a negative number of
+    // children, a duplicate (generation, source, part), more inputs than announced, and an input of a generation or
+    // source that nobody announced. After a throw, call reset(). `rank`: the rank that sent it, if known, for the text
+    // of errors.
     void arrive(int generationIndex, std::uint32_t source, std::uint16_t part, int children, int rank = -1)
     {
         const Input input{generationIndex, source, part, rank, children};
@@ -220,7 +221,7 @@ private:
                  detail::printed("its rank did not declare it, part %d", input.part));
     }
 
-    // Blames the first input of a generation, where the culprit cannot be told from the others.
+    // Names the first input of a generation, if the wrong one cannot be told from the others.
     [[noreturn]] void failAt(int generationIndex, ErrorKind kind, std::int64_t expected, std::int64_t got) const
     {
         const auto first = firstFrom(generationIndex);
@@ -228,7 +229,7 @@ private:
         fail(kind, generationIndex, isThere ? first->source : 0, isThere ? first->rank : -1, expected, got, "");
     }
 
-    // Fails because the same input came twice: from these two ranks, which may be equal, and are -1 if not known.
+    // Fails because an input came twice: from these ranks, which may be equal; -1: not known.
     [[noreturn]] static void failTwice(int generation, std::uint32_t source, std::uint16_t part, int rank,
                                        int otherRank)
     {
@@ -257,7 +258,7 @@ private:
         throw Error(std::move(info));
     }
 
-    // The most generations that one input may add: an input with a wrong generation must not take all memory.
+    // The most generations that one input may add, so that a wrong one cannot take all memory.
     static constexpr std::size_t mostAhead = 64;
 
     std::vector<Generation> generations_; // the first generations

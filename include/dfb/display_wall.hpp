@@ -40,10 +40,10 @@ struct ToWall {
 //   wall.finish(report.frame);
 //   ... wall.image(display) on the rank that drives it
 //
-// Memory: for each display that it drives, a rank has the image that is shown, and one image for each frame (16 at
-// most) of which parts have come and that is not finished yet. The constructor allocates the first of these. If a later
-// one cannot be allocated, the connection fails. At most `poolBytes` are on the way to such a rank. A frame without
-// finish() keeps some bytes on every rank until the next finish().
+// Memory: for each display that it drives, a rank has the image that is shown, and an image for each unfinished frame
+// of which parts have come (16 at most). The constructor allocates two images for each display. If a later one cannot
+// be allocated, the connection fails. At most `poolBytes` are on the way to such a rank. A frame without finish() keeps
+// some bytes on every rank until the next finish().
 class DisplayWall {
 public:
     // Makes a wall whose displays show images in `format`. `executor` runs its work; null: threads of its own, beside
@@ -61,19 +61,19 @@ public:
 
     const WallLayout& layout() const noexcept { return layout_; }
 
-    // The configuration of a framebuffer of the wall's size, whose image goes to the wall only.
+    // The configuration of a framebuffer of the wall's size, whose image goes to the wall only. Any thread.
     FrameBufferConfig frameBufferConfig() const { return {layout_.width(), layout_.height(), OutputFormat::None}; }
 
-    // Waits until all displays have frame number `frame`: that is the moment to show it on all of them. Collective.
-    // Call it after a frame has ended, once, in the order of the frames. A frame may be left out. A display's rank
-    // keeps parts of 16 frames at most, and drops the oldest if later ones come. All frames of a wall must be of one
-    // framebuffer, before its resize(). Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same
-    // on all ranks: TimedOut if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if
-    // the ranks have not sent all of it, because it failed or was partial, or if a display has dropped it;
-    // MalformedMessage if a part of it cannot be right. The displays then keep their picture. Throws TransportError if
-    // the connection fails. Throws InvalidArgument, on this rank alone, on a thread that may not call MPI, or for a
-    // frame that is not later than the last or that no rank can have begun. A number that is too large by a few is not
-    // noticed: earlier frames can then no longer be finished.
+    // Waits until all displays have frame number `frame`, so that all can show it now. Collective. Call it once, after
+    // the frame has ended, in the order of the frames. A frame may be left out. A display's rank keeps parts of 16
+    // frames at most, and drops the oldest if later ones come. All frames of a wall must be of one framebuffer, before
+    // its resize(). Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks.
+    // TimedOut: a display has not got the whole frame within `timeout` (0: no limit). MissingInput: the ranks have not
+    // sent all of it, because it failed or was partial, or a display has dropped it. MalformedMessage: a part of it
+    // cannot be right. The displays then keep their picture. Throws TransportError if the connection fails. Throws
+    // InvalidArgument, on this rank alone, on a thread that may not call MPI, or for a frame that is not later than the
+    // last or that no rank can have begun. A number that is up to 16 too large is not noticed; earlier frames can then
+    // no longer be finished.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before

@@ -25,9 +25,9 @@ public:
     using Tile = dfb::Tile<Channels, Size>;
     using TileView = dfb::TileView<Channels, Size>;
 
-    // Prepares `tile` for a tile and a pass of this frame: clears it, and sets generation 0, no children, this rank
-    // as source, and part 0. Channels beside colour and depth are only cleared if they are sent in this frame.
-    // Throws InvalidArgument if there is no such tile or pass.
+    // Prepares `tile` for a tile and a pass of this frame: clears it, and sets generation 0, no children, this rank as
+    // source, and part 0. Other channels than colour and depth are cleared only if they are sent in this frame. Throws
+    // InvalidArgument if there is no such tile or pass.
     void start(Tile& tile, int tileIndex, int pass = 0) const
     {
         static_cast<TileHeader&>(tile) = engine()->headerOf(tileIndex, pass);
@@ -41,13 +41,13 @@ public:
         static_cast<TileHeader&>(tile) = header;
     }
 
-    // Sends the active pixels of a rendered tile to its owner. `tile` can be used again when setTile() returns.
-    // Sends nothing in a frame that has failed, or after end(), but checks the tile even then. Waits only while
-    // more than messages.poolBytes are under way from this rank, and runs tasks of the executor meanwhile; a thread
-    // that may not call MPI does not wait. Throws InvalidArgument, with nothing sent, for a tile of another frame,
-    // for an index, region or pass that the frame does not have, for a generation that is not 0 to 65535, and for a
-    // negative number of children. Throws OutOfMemory, and what the codec throws. An input that contradicts others
-    // (too many, sent twice, not announced) makes the frame fail: end() throws.
+    // Sends the active pixels of a rendered tile to its owner. `tile` can be used again when setTile() returns. After
+    // end(), and in a frame that has failed, it checks the tile but sends nothing. Waits only while more than
+    // messages.poolBytes are under way from this rank, and runs tasks of the executor meanwhile. A thread that may not
+    // call MPI does not wait. Throws InvalidArgument, with nothing sent, for a tile of another frame, an index, region
+    // or pass that the frame does not have, a generation that is not 0 to 65535, or a negative number of children.
+    // Throws OutOfMemory, and what the codec throws. An input that contradicts others (too many, sent twice, not
+    // announced) makes the frame fail: end() throws.
     void setTile(const Tile& tile) { engine()->setTile(tile); }
     // Sends pixels that lie in your own memory. They are not read after setTile() has returned, unless you promise
     // TileView::staysUntilEnd. Waits and throws as above. Also throws InvalidArgument if a channel that must be
@@ -59,12 +59,11 @@ public:
     bool hidesRest(const Tile& tile) const { return opaqueHides(tile.tile) && tile.isOpaque(); }
     bool hidesRest(const TileView& tile) const { return opaqueHides(tile.tile) && tile.isOpaque(); }
 
-    // Calls job(i, tile) for each i in [0, count), by Executor::parallelFor(), so several threads call it at once.
-    // Each thread has a tile of its own: a Tile, or a TileView if that is the template argument. The job calls
-    // start(tile, ...), renders, and calls setTile(tile). Any thread may call forEachTile(). Not collective. Waits
-    // until all jobs have returned; it waits for other ranks only inside setTile(). Throws nothing: an exception of
-    // a job makes the frame fail as in guard(), and no other job begins; with FrameConfig::allowPartial the frame
-    // goes on without that job's tile.
+    // Calls job(i, tile) for each i in [0, count), by Executor::parallelFor(): on several threads at once. Each thread
+    // has a tile of its own: a Tile, or a TileView if that is the template argument. The job calls start(tile, ...),
+    // renders, and calls setTile(tile). Any thread may call forEachTile(). Not collective. Waits until all jobs have
+    // returned, and for other ranks only inside setTile(). Throws nothing. An exception of a job makes the frame fail
+    // as in guard(), and no other job begins. With FrameConfig::allowPartial the frame goes on without that job's tile.
     template <class WorkerTile = Tile, class Job>
     void forEachTile(std::int64_t count, const Job& job)
     {
@@ -146,12 +145,12 @@ public:
 
     // Begins a frame. Every rank must call it, with an equal `params`. If several frames are open, all ranks must call
     // begin() and end() in the same order: a rank takes inputs of a frame only after its own begin() of it, and
-    // setTile() on other ranks may wait for that. Copies `tileData` and `pixelData`. `failure`: an exception that was
-    // thrown while `params` were made, if any. If it is given, or if copying or newFrame() of the pixel operation
-    // throws, end() throws a FrameError with the text on all ranks, as after Frame::abort(). Waits for no other rank.
-    // Throws InvalidArgument, with nothing sent, if the frame that was begun config.framesInFlight frames ago is still
-    // open, if a field of `params` is out of range, or on a thread that may not call MPI (see Progress). Throws
-    // TransportError if the connection has failed.
+    // setTile() on other ranks may wait for that. Copies `tileData`, and passes `pixelData` to newFrame() of the pixel
+    // operation. `failure`: an exception that was thrown while `params` were made, if any. If it is given, or if the
+    // copy or newFrame() throws, end() throws a FrameError with the text on all ranks, as after Frame::abort(). Waits
+    // for no other rank. Throws InvalidArgument, with nothing sent, if the frame that was begun config.framesInFlight
+    // frames ago is still open, if a field of `params` is out of range, or on a thread that may not call MPI (see
+    // Progress). Throws TransportError if the connection has failed.
     Frame begin(const FrameConfig& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {}, const std::exception_ptr& failure = nullptr)
     {

@@ -1,4 +1,4 @@
-// The errors of dfb: a record of each error and its place, and the exceptions that carry it.
+// The errors of dfb: a record of an error and its place, and the exceptions that carry it.
 //
 // InvalidArgument is thrown by the call that was wrong; collective calls throw it on all ranks unless they say
 // otherwise. An error in the background of a frame comes out of Frame::end() as FrameError, the same on every rank.
@@ -78,7 +78,7 @@ inline const char* toString(ErrorKind kind)
 struct ErrorInfo {
     ErrorKind kind = ErrorKind::InvalidArgument;
     // The rank where it went wrong: its code threw, it cancelled or left the frame, it passed a wrong argument, or it
-    // is lost. For wrong or missing inputs and messages: the rank that noticed, which need not be the one to blame.
+    // is lost. For wrong or missing inputs and messages: the rank that noticed, which may not have caused it.
     int rank = -1;
     // The rank that the input or message came from. If something did not come (TimedOut, MissingInput, Transport): the
     // rank that should have sent it; for a missing input of a tile, the rank that announced it.
@@ -92,7 +92,7 @@ struct ErrorInfo {
     std::int64_t got = -1;
     std::string message; // the detail in words, may be empty
 
-    // One line that names everything that applies.
+    // One line with all that applies.
     std::string describe() const;
 };
 

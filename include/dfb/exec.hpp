@@ -1,5 +1,5 @@
-// Executor: runs the tasks of a framebuffer and the loops of a renderer. A ThreadExecutor runs them on std::threads of
-// its own, a CallerExecutor on the threads that call it, a TbbExecutor (tbb_executor.hpp) in a oneTBB arena of its own.
+// Executor: runs the tasks of a framebuffer and the loops of a renderer. A ThreadExecutor runs them on its own
+// std::threads, a CallerExecutor on the threads that call it, a TbbExecutor (tbb_executor.hpp) in its own oneTBB arena.
 #pragma once
 
 #include <dfb/base/fifo.hpp>
@@ -48,8 +48,8 @@ public:
         }
     }
 
-    // Runs the oldest waiting task on the calling thread, and returns when it has ended. For threads that have to wait
-    // for something. Any thread. Returns false, at once, if no task waits.
+    // Runs the oldest waiting task on the calling thread, and returns true when it has ended. Returns false at once if
+    // no task waits. For threads that have to wait. Any thread.
     bool help()
     {
         Task task;
@@ -71,10 +71,9 @@ public:
     }
 
     // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Any thread may call it,
-    // several at once. Waits until all these calls have returned. On a worker of a ThreadExecutor, that thread alone
-    // runs the loop. Rethrows the first exception of a body; after it no other body begins.
-    // `meanwhile`: called on the calling thread every millisecond while that waits, if it takes no part in the loop.
-    // Must not throw.
+    // several at once. Waits until all these calls have returned. If a worker of a ThreadExecutor calls it, that worker
+    // alone runs the loop. Rethrows the first exception of a body; after it no other body begins. If the calling thread
+    // takes no part in the loop, it calls `meanwhile` every millisecond, which must not throw.
     void parallelFor(std::size_t count, detail::FunctionRef<void(std::size_t)> body,
                      const std::function<void()>& meanwhile = nullptr)
     {
@@ -91,7 +90,7 @@ public:
                 if (!stop.exchange(true))
                     error = std::current_exception();
             }
-            // Not within a task: otherwise tasks that contain loops would nest without a limit.
+            // Not within a task: tasks that contain loops would nest without a limit.
             while (depth() == 0 && help()) {
             }
         };
@@ -128,8 +127,8 @@ private:
 // A fixed number of threads. The destructor runs the tasks that were submitted, then joins.
 class ThreadExecutor final : public Executor {
 public:
-    // `threadCount` workers; 0: one for each processor that the calling thread may run on. Where several ranks share
-    // them, that is too many: see Connection::threadShare(). Throws std::system_error if the system gives no more
+    // `threadCount` workers; 0: one for each processor that the calling thread may run on. That is too many if several
+    // ranks share the processors: see Connection::threadShare(). Throws std::system_error if the system gives no more
     // threads.
     explicit ThreadExecutor(int threadCount = 0)
     {
@@ -150,8 +149,8 @@ public:
     int concurrency() const noexcept override { return static_cast<int>(threads_.size()); }
     bool hasWorkers() const noexcept override { return resting_ == 0; }
 
-    // Suspends (true) or resumes (false) the workers. Calls nest and must balance. Meanwhile loops and tasks run on
-    // threads that call, as with a CallerExecutor. Any thread.
+    // Suspends (true) or resumes (false) the workers. Calls nest and must balance. While they rest, loops and tasks run
+    // on the calling threads, as with a CallerExecutor. Any thread. Waits for nothing.
     void rest(bool more)
     {
         {
@@ -266,9 +265,9 @@ private:
 
 // Has no threads of its own. Loops run on the thread that calls parallelFor(). Tasks run on that thread between two
 // iterations, on threads that call setTile() or poll(), and on a thread that waits for a frame. For ranks that have one
-// core each. With Progress::Caller as well, the library does nothing while the program does not call it, and other
-// ranks may wait. Framebuffers whose frames are open at the same time must share one: a rank that waits in one frame
-// runs the tasks of all of them, so that other ranks find room for their messages.
+// core each. With Progress::Caller as well, the library works only while the program calls it, and other ranks may wait
+// for that. Framebuffers whose frames are open at the same time must share one executor. A rank that waits in one frame
+// then runs the tasks of all, so that other ranks find room for their messages.
 class CallerExecutor final : public Executor {
 public:
     ~CallerExecutor() override

@@ -1,6 +1,6 @@
-// Fragment: one input of a tile: its header and, per channel, the active row spans. It either owns the message that
-// brought it, and its pixels are read there, or it is a view of pixels that lie in the memory of a renderer
-// (TileView::staysUntilEnd).
+// Fragment: one input of a tile: its header, and the active pixels of each channel. It owns the message that brought
+// it, and its pixels are read there; or it is a view of pixels in the memory of a renderer (TileView::staysUntilEnd).
+// Any thread may call const members.
 #pragma once
 
 #include <dfb/tile.hpp>
@@ -74,7 +74,7 @@ public:
     std::uint32_t activePixels() const noexcept { return parts_.activePixels; } // InPlace: 0, as it is not known
     // Whether the pixels have 8 bits a channel. FragmentCursor::nextBytes() may be called only then.
     bool keepsBytes() const noexcept { return parts_.bytes || parts_.inPlace.activity.hasBytes; }
-    // Whether FragmentCursor has to convert or copy each row before it can return it.
+    // Whether FragmentCursor converts or copies each row.
     bool isMadeByRow() const noexcept { return parts_.bytes || parts_.encoding == FragmentEncoding::InPlace; }
     bool hasDepth() const noexcept { return parts_.depth != nullptr || parts_.inPlace.depth != nullptr; }
     ChannelMask channels() const noexcept { return parts_.channels; } // those that travelled
@@ -116,14 +116,14 @@ private:
 };
 
 // The pixels of a row with 8 bits a channel, read where they lie. Like FragmentRow, with `bytes` instead of colours.
-// Some of the pixels may not be active: those whose depth is not below the limit, and those that are 0.
+// Pixels whose depth is not below the limit, and pixels that are 0, are not active.
 struct ByteRow : FragmentRow {
     const std::byte* bytes = nullptr;
     float depthLimit = std::numeric_limits<float>::infinity();
     Span valid; // the one span of a fragment in place
 };
 
-// Walks the rows of a fragment from top to bottom. The fragment must outlive it.
+// Walks the rows of a fragment from top to bottom. The fragment must outlive it. One thread at a time may use it.
 class FragmentCursor {
 public:
     // `row` is scratch memory for a fragment that isMadeByRow(); if it is null, the cursor allocates its own.
@@ -201,8 +201,8 @@ public:
     }
     const detail::ConstPlanes& aux() const noexcept { return aux_; } // of the row that next() returned
 
-    // Sets `row` to the place of the next row of pixels in place, without moving on; skip(1) moves on. Returns false if
-    // the row has no pixels, is not in place, or must be converted.
+    // Sets `row` to where the next row lies, if it is read in place, without moving on; skip(1) moves on. Returns false
+    // if the row has no pixels, is not in place, or must be converted.
     bool findInPlace(detail::RowInPlace& row) const
     {
         return isInPlace() && parts_->inPlace.activity.byColorAlone() && findPlaces(row_, row);

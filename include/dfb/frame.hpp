@@ -38,8 +38,8 @@ struct ImageConfig {
 struct MessageConfig {
     std::shared_ptr<const Codec> codec{}; // compresses messages; null: none are compressed
     CompressionMode compression = CompressionMode::Always;
-    // Limits the bytes of inputs and finished tiles in a rank's inbox and on the way to it. Also limits what a rank has
-    // under way to others before setTile() waits. It is raised to 4 times the largest possible message if it is less.
+    // Limits the bytes of inputs and finished tiles in a rank's inbox and on the way to it. If a rank has more than
+    // this under way to others, setTile() waits. Raised to 4 times the largest possible message if it is less.
     std::size_t poolBytes = std::size_t{64} << 20;
 };
 
@@ -57,9 +57,9 @@ struct FrameBufferConfig {
     // is exact. Depth, positions and ids always travel exactly; normals and albedo are scaled to the rounded alpha.
     // Finished tiles travel in image.format. All ranks must give the same.
     Precision precision{};
-    // For all operations of the library but DepthComposite. If the layers of a pixel let through less than this
-    // fraction of the light, what is behind them is left out, also the background. The pixel changes by no more than
-    // this times the largest colour. 0 (exact) to below 1. All ranks must give the same.
+    // Early termination, in all operations of the library but DepthComposite. If the layers of a pixel let through less
+    // than this fraction of the light, the layers behind them and the background are left out. The pixel changes by no
+    // more than this times the largest colour. 0 (exact) to below 1. All ranks must give the same.
     float minTransmittance = 0;
     // How many frames may be open at once, 1 or more. Memory grows with it. Operations that keep state allow one. All
     // ranks must give the same.
@@ -71,14 +71,14 @@ struct FrameBufferConfig {
     // for each composited tile, when its pixels are in the image of the open frame. A tile without active pixels is
     // left out if the operation is one of the library's (not Progressive), the pixel operation is pointwise, and its
     // inputs are not read in place. Worker threads call it, and your own threads in setTile(), poll(), loops and calls
-    // that wait, such as end(); for several tiles at once, while other pixels of the image are still being written. It
-    // must be quick. An exception makes the frame fail. For tiles whose owners are on the display rank's node, all
-    // calls may come at the end of the frame.
+    // that wait, such as end(). It is called for several tiles at once, while other pixels of the image are still being
+    // written. It must be quick. An exception makes the frame fail. For tiles whose owners are on the display rank's
+    // node, all calls may come at the end of the frame.
     TileCallback onTile{};
     // After this time in end(), ranks check whether a message is still under way; they check again at growing
-    // intervals. If no message is, the frame fails with ErrorKind::MissingInput. 1 ms to 24 days. A short time costs a
+    // intervals. If twice none is, the frame fails with ErrorKind::MissingInput. 1 ms to 24 days. A short time costs a
     // few messages in each slow frame. If a tile may be hidden, an OrderedLoop waits at most this long for the message
-    // that says so, then renders the tile. Ranks may give different times.
+    // that says so. Then it renders the tile. Ranks may give different times.
     std::chrono::milliseconds quiet{2000};
     // Records what this rank does for its frames, and when: see trace.hpp. Null: nothing is recorded, at no cost. Ranks
     // may give different ones.
@@ -95,27 +95,27 @@ using SamplePlan = std::shared_ptr<const std::vector<TileSamples>>;
 // that ends a frame.
 struct FrameConfig {
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA behind everything
-    // Samples a pixel, 1 or more; each is a pass. They are numbered from 0, or, with a tile operation that has
-    // keepsState, from where the last frame with this accumulationId stopped.
+    // Samples a pixel, 1 or more; each is a pass. They are numbered from 0. With a tile operation that has keepsState
+    // they go on from the last frame, if that had this accumulationId.
     int passes = 1;
     // If not null, it has the samples of each tile, by the tile's index, and replaces `passes`; see sampling.hpp. A
-    // tile without samples is not rendered, and the image keeps its pixels from the last frame, which must have ended
-    // well, and with keepsState must have had the same accumulationId. An operation without keepsState begins with
-    // sample 0, and may leave tiles out only with framesInFlight 1 and a pixel operation that is pointwise.
+    // tile without samples is not rendered, and the image keeps its pixels from the last frame. That frame must have
+    // ended well, and with keepsState must have had the same accumulationId. Without keepsState the samples of a tile
+    // begin with 0, and tiles without samples need framesInFlight 1 and a pixel operation that is pointwise.
     SamplePlan samples;
     // For an ErrorBudget or HalfLevel: the most inputs that a pixel has in a pass. 0: not known, counts as 65536.
     // ImageParallelLoop, MixedParallelLoop, OrderedLoop and ImageCompositor set it; the other loops do not.
     int maxLayers = 0;
     // For tile operations with keepsState, such as Progressive: the image is the mean of the samples of all consecutive
-    // frames with this id. Give another id when camera, scene or background change; the samples of each tile then begin
-    // with 0. They also begin with 0 after a frame that failed or was partial, and in a frame without `samples` that
-    // follows a frame with them.
+    // frames with this id. Give another id when camera, scene or background change: the samples of each tile then begin
+    // with 0. They also do so after a frame that failed or was partial, and in a frame without `samples` that follows a
+    // frame with them.
     std::uint64_t accumulationId = 0;
     // False: inputs of generation 0 announce the others, as in the paper, and every tile needs one of them per pass.
     // True: each rank calls Frame::declare(), and owners wait for the declared inputs. Loops set it themselves.
     bool declared = false;
     // The frame fails with ErrorKind::TimedOut if it is not complete this long after a rank called end(). It also fails
-    // if setTile() waits for room, and no receiver takes a message of this rank for this long; or if nextJobs() waits
+    // if setTile() waits for room and no receiver takes a message of this rank for this long, or if nextJobs() waits
     // this long. The error says what is missing and from whom. If there is still no verdict after twice the time, end()
     // throws TransportError. 0: no limit. At most 24 days. An input that is never sent needs no time-out: the frame
     // fails with ErrorKind::MissingInput some seconds after all ranks are in end().
@@ -129,15 +129,15 @@ struct FrameConfig {
     // If not null, it says which rank owns which tile in this frame, in place of ImageConfig::ownerMap. The image does
     // not depend on it. Not allowed for operations that keep state. Loops set it themselves: see ImageConfig::ownerMap.
     TileOwners owners{};
-    // True: a frame that fails still gives the tiles that were finished. end() then throws no FrameError but sets
-    // FrameReport::failure; DistributedFrameBuffer::isComplete() tells which tiles there are. If a renderer or an
+    // True: a frame that fails still gives the tiles that were finished. end() then sets FrameReport::failure in place
+    // of a FrameError, and DistributedFrameBuffer::isComplete() tells which tiles there are. If a renderer or an
     // operation throws, or inputs of a tile contradict each other, only that tile is lost. A tile with a missing input
     // is given up when nothing is under way any more, or after `timeout`. A message that cannot be read ends the frame
-    // at once, unless there is a time-out. If ranks disagree about these parameters, end() throws nevertheless.
+    // at once, unless there is a time-out. If ranks disagree about these parameters, end() still throws.
     bool allowPartial = false;
 };
 
-// Declares that an input of generation 1 will come for this tile in each pass of the frame.
+// An input of generation 1 that will come for this tile in each pass of the frame: see Frame::declare().
 struct TileInput {
     int tile = 0;
     std::uint32_t source = 0;
@@ -181,14 +181,14 @@ struct FrameSums {
     std::int64_t alphaOutsidePixels = 0;   // finite input pixels whose alpha is not within [0, 1]
     std::int64_t orderUndefinedPixels = 0; // of finished tiles, see TileReport
     std::int64_t compressedLinks = 0;      // pairs of sender and receiver for which compression paid
-    // Since the last verdict: messages with pixels that came after the end of their frame, and errors that came too
-    // late for it. Inputs that a frame drops after it has failed do not count.
+    // Since the last verdict: messages with pixels that came after the end of their frame, and errors that came after
+    // their rank's vote. Inputs that a frame drops after it has failed do not count.
     std::int64_t lateMessages = 0;
     std::int64_t repeatedMessages = 0; // messages that came twice and were dropped, since the last verdict
 };
 
-// Figures of a finished frame. FrameSums and those marked "all" are the same on all ranks. They include what
-// each rank counted until it entered the verdict. The others are this rank's own.
+// Figures of a finished frame. FrameSums and those marked "all" are the same on all ranks, and include all that ranks
+// counted before the verdict. The others are this rank's own.
 struct FrameReport : FrameSums {
     std::int64_t frame = 0;
     std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why the frame failed, if it did

@@ -1,5 +1,5 @@
-// FrameBufferBase and FrameBase: what a DistributedFrameBuffer and its frames can do that does not depend on the type
-// of their operations, transport and tiles. It is no template, so it is compiled once.
+// FrameBufferBase and FrameBase: the members of a DistributedFrameBuffer and of its frames that do not depend on the
+// types of operations, transport and tiles. They are no templates, so they are compiled once.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
@@ -24,9 +24,9 @@ DFB_NAMESPACE_BEGIN
 class FrameBufferBase;
 
 // A frame that has begun, without what depends on the type of its tiles: DistributedFrameBuffer::begin() returns a
-// BasicFrame. If it is destroyed without end(), the frame fails on all ranks (after isDone() it may also end well), and
-// the destructor waits until all ranks know that. Where a member does not say otherwise, any thread may call it, it
-// waits for nothing, and nobody checks the index of a tile.
+// BasicFrame. If it is destroyed without end(), the frame fails on all ranks, except that it may end well after
+// isDone(). The destructor waits until all ranks know the result. Unless a member says otherwise, any thread may call
+// it, it waits for nothing, and the index of a tile is not checked.
 class FrameBase {
 public:
     FrameBase(FrameBase&&) noexcept = default;
@@ -39,12 +39,12 @@ public:
     int tileOwner(int tile) const noexcept { return engine_->ownerNow(tile); }
     const std::vector<int>& ownedTiles() const noexcept { return engine_->ownedNow(); }
 
-    // True if this rank was told, by hide(), that inputs of this generation cannot be seen: they need not be
-    // rendered, and setTile() drops them. Always false unless the operation has opaqueHides().
+    // True if hide() has told this rank that inputs of this generation cannot be seen: they need not be rendered, and
+    // setTile() drops them. Always false unless the operation has opaqueHides().
     bool isHidden(int tileIndex, int generation) const { return engine_->isHidden(tileIndex, generation); }
-    // Tells `rank` that inputs of this generation and higher ones cannot be seen. The tile operation drops those
-    // that come nevertheless. Throws InvalidArgument if there is no such tile or rank, if `generation` is below 1,
-    // or if opaqueHides(tileIndex) is false.
+    // Tells `rank` that inputs of this generation and higher ones cannot be seen. The tile operation drops those that
+    // still come. Throws InvalidArgument if there is no such tile or rank, if `generation` is below 1, or if
+    // opaqueHides(tileIndex) is false.
     void hide(int tileIndex, int generation, int rank) const
     {
         engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Hides});
@@ -64,8 +64,8 @@ public:
     {
         engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Shows});
     }
-    // Whether this rank was told, by mayHide(), that inputs of that generation may be hidden, and not yet by hide()
-    // or show() whether they are.
+    // Whether mayHide() has told this rank that inputs of that generation may be hidden, and neither hide() nor show()
+    // has followed.
     bool isUndecided(int tileIndex, int generation) const { return engine_->isUndecided(tileIndex, generation); }
     // Waits until heard() returns true or the frame has failed, and returns true. Returns false after
     // FrameBufferConfig::quiet: render without waiting then. heard() is called first, and again after each hide(),
@@ -74,27 +74,26 @@ public:
     // be one that may call MPI. If the transport fails, it returns true or throws TransportError.
     bool waitForWord(detail::FunctionRef<bool()> heard) const { return engine_->waitForWord(heard); }
 
-    // Declares inputs of generation 1. They must then come in each pass; one without pixels costs a header. Each is
-    // declared by one rank, which need not be the one that sends it. In a frame with FrameConfig::declared every
-    // rank must call this once, with an empty list if it declares nothing; otherwise end() fails the frame. It may
-    // come after the first setTile(). Children of these inputs are not declared. A list equal to that of the last
-    // frame is not sent again. Only one thread may call it. Throws InvalidArgument, with nothing declared, for a
-    // tile outside the image, for a second call, and in a frame without FrameConfig::declared.
+    // Declares inputs of generation 1, which must then come in each pass. One without pixels costs a header. One rank
+    // declares each input; another one may send it. In a frame with FrameConfig::declared every rank must call this
+    // once, with an empty list if it declares nothing; otherwise end() fails the frame. The call may come after the
+    // first setTile(). Children of these inputs are not declared. A list equal to that of the last frame is not sent
+    // again. Only one thread may call it. Throws InvalidArgument, with nothing declared, for a tile outside the image,
+    // for a second call, and in a frame without FrameConfig::declared.
     void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
 
-    // Replaces FrameConfig::maxLayers for the inputs of this rank, for a renderer that learns this number only
-    // after begin(). Ranks may give different numbers. Call it before the first setTile(), on one thread.
+    // Replaces FrameConfig::maxLayers for the inputs of this rank, if the renderer learns the number only after
+    // begin(). Ranks may give different numbers. Call it before the first setTile(), on one thread.
     void expectLayers(int layers) { engine_->expectLayers(layers); }
 
     // The samples that a tile gets in this frame.
     TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 
-    // Hands out the jobs [0, count) to all ranks: returns the next range for this rank. Each job goes to one rank.
-    // An empty range means that no jobs are left, or that the frame or the transport has failed. `count` must be
-    // the same on all ranks and in all calls. Only the thread that began the frame may call it, and not from a
-    // task. Waits for the rank that hands out the jobs, usually not for long, because the previous call has asked
-    // for this range. If it waits longer than FrameConfig::timeout, the frame fails. Throws InvalidArgument for a
-    // count below 0.
+    // Hands out the jobs [0, count) to all ranks: returns the next range for this rank. Each job goes to one rank. An
+    // empty range means that no jobs are left, or that the frame or the transport has failed. `count` must be the same
+    // on all ranks and in all calls. Only the thread that began the frame may call it, and not from a task. Waits for
+    // the rank that hands out the jobs: usually not long, because the previous call has asked for this range. If it
+    // waits longer than FrameConfig::timeout, the frame fails. Throws InvalidArgument for a count below 0.
     JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
     // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. Use it for
@@ -103,12 +102,12 @@ public:
     // the frame ends: call it before this rank's end().
     void addFigure(std::uint64_t key, double value) const { engine_->addFigure(key, value); }
 
-    // Notes that an input of that tile was simplified, so that a pixel of one pass may be off by up to `bound`, in
-    // units of colour; see FrameReport::mergeErrorBound. Call it before this rank's end(). Throws InvalidArgument
-    // for a tile outside the image.
+    // Notes that an input of that tile was simplified: a pixel of one pass may be off by up to `bound`, in units of
+    // colour. See FrameReport::mergeErrorBound. Call it before this rank's end(). Throws InvalidArgument for a tile
+    // outside the image.
     void noteMergeError(int tileIndex, double bound) const { engine_->noteMergeError(tileIndex, bound); }
 
-    // Whether the frame has failed on some rank, as far as this rank knows. If so, there is no use in rendering on.
+    // Whether the frame has failed on some rank, as far as this rank knows. If so, stop rendering.
     bool failed() const noexcept { return engine_->failed(); }
 
     // Calls body(), which is a rendering loop of your own or a part of it. If body() throws, guard() passes the
@@ -131,22 +130,22 @@ public:
         engine_->abort(number_, std::make_exception_ptr(reason), -1);
     }
 
-    // Ends the frame. Call it once. Collective; with several framebuffers in the same order on all ranks, or in any
-    // order once isDone() or tryEnd() has been called for all of their frames on all ranks. This rank's last setTile()
-    // must have returned: an input that is not sent when all ranks are in end() counts as missing. Waits until all
-    // tiles of all ranks are finished and the display rank has the image, or until the frame has failed. It fails, too,
-    // if nothing is under way that could complete it (ErrorKind::MissingInput). Throws FrameError, the same on every
-    // rank; with FrameConfig::allowPartial it returns instead, with FrameReport::failure set, unless ranks disagree.
-    // Throws TransportError. In all these cases the frame is over; after a FrameError the next one may begin. Throws
-    // InvalidArgument after the frame has ended, and on a thread that may not call MPI (see Progress), which leaves the
-    // frame open.
+    // Ends the frame. Call it once. Collective. With several framebuffers call it in the same order on all ranks; once
+    // isDone() or tryEnd() has been called for all of their frames on all ranks, any order will do. This rank's last
+    // setTile() must have returned: an input that is not sent when all ranks are in end() counts as missing. Waits
+    // until all tiles of all ranks are finished and the display rank has the image, or until the frame has failed. It
+    // also fails if nothing is under way that could complete it (ErrorKind::MissingInput). Throws FrameError, the same
+    // on every rank. With FrameConfig::allowPartial it returns instead, with FrameReport::failure set, unless ranks
+    // disagree. Throws TransportError. In all these cases the frame is over. After a FrameError the next one may begin.
+    // Throws InvalidArgument after the frame has ended, and on a thread that may not call MPI (see Progress), which
+    // leaves the frame open.
     FrameReport end();
 
-    // Whether end() would return without waiting for other ranks: the frame is complete everywhere, or has failed.
-    // For programs that do something else meanwhile, such as a window: call it again and again, then end(). The
-    // first call begins the end of the frame on this rank, so this rank's last setTile() must have returned. Moves
-    // messages if no thread does, and keeps to FrameConfig::timeout. Waits for nothing. end() may still take a
-    // moment if the frame timed out or is partial. Throws InvalidArgument as end() does.
+    // Whether end() would return without waiting for other ranks: the frame is complete everywhere, or has failed. For
+    // programs that do something else meanwhile, such as a window: call it repeatedly, then end(). The first call
+    // begins the end of the frame on this rank, so this rank's last setTile() must have returned. Moves messages if no
+    // thread does, and keeps to FrameConfig::timeout. Waits for nothing. end() may still take a moment if the frame
+    // timed out or is partial. Throws InvalidArgument as end() does.
     bool isDone()
     {
         requireOpen();
@@ -195,8 +194,8 @@ private:
     std::unique_ptr<detail::Engine, detail::LeaveFrame> open_; // engine_, until this has ended or was moved from
 };
 
-// A DistributedFrameBuffer without what depends on its operations and its transport. A function that takes a
-// FrameBufferBase& and a FrameBase& need be no template.
+// The members of a DistributedFrameBuffer that do not depend on its operations and its transport. A function that takes
+// a FrameBufferBase& and a FrameBase& need not be a template.
 class FrameBufferBase {
 public:
     using Config = FrameBufferConfig;
@@ -226,7 +225,7 @@ public:
     const Image& image() const noexcept { return lastEnded_->image(); }
 
     // Copies the display rank's image() to every rank, and returns it; an empty image if image() is empty there. The
-    // bytes travel along a tree of the ranks. Takes memory for several more images on every rank while it runs.
+    // bytes travel along a tree of the ranks. Every rank needs memory for several more images while it runs.
     // Collective. Call it while no frame is open; this is not checked. Waits and throws as allGather().
     Image imageOnAllRanks() { return lastEnded_->imageOnAllRanks(engine()); }
 
@@ -237,29 +236,30 @@ public:
     // see FrameConfig::allowPartial. Thread as above.
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
-    // For programs without a progress thread (Progress::Caller) or without workers (CallerExecutor); otherwise it does
-    // nothing. Moves messages, if this thread may call MPI (see Progress), and runs waiting tasks. Returns whether
-    // there was anything to do. Call it now and then during long work without setTile(), so that compositing goes on
-    // and other ranks need not wait. Not needed in the jobs of a loop. Any thread. Waits for no other rank.
+    // For programs without a progress thread (Progress::Caller) or without workers (CallerExecutor); otherwise it has
+    // nothing to do. Without a progress thread it moves messages, if this thread may call MPI (see Progress). Without
+    // workers it runs waiting tasks. Returns whether there was anything to do. Call it now and then during long work
+    // without setTile(), so that compositing goes on and other ranks need not wait. Not needed in the jobs of a loop.
+    // Any thread. Waits for no other rank.
     bool poll() { return engine().poll(); }
 
-    // Changes the size of the image, in pixels. Afterwards image() is empty, tile operations are made anew and have
-    // lost what they kept, and frames are numbered from 1 again. A Frame of before must not be used any more, not even
-    // to cancel it. Collective, outside frames. Waits for all ranks.
-    // Throws InvalidArgument, with nothing changed: on this rank if a frame is open, on all ranks if the size is not 1
-    // to 65536 or differs between ranks, or if memory is short. Throws TransportError.
+    // Changes the size of the image, in pixels. Afterwards image() is empty, tile operations have lost what they kept,
+    // and frames are numbered from 1 again. An older Frame must not be used any more, not even to cancel it.
+    // Collective, outside frames. Waits for all ranks. Throws InvalidArgument, with nothing changed: on this rank if a
+    // frame is open, on all ranks if the size is not 1 to 65536 or differs between ranks, or if memory is short. Throws
+    // TransportError.
     void resize(int width, int height);
 
     // Returns memory for pixels that all ranks of the node can read: see TileView::staysUntilEnd. It is not cleared,
-    // and aligned to 64 bytes. If it has at most 1536 bytes, or there is no shared memory, or no more of it (4 GiB a
-    // rank), it is memory of this rank alone, and pixels in it must be sent. Any thread. Waits for nothing. Throws
+    // and aligned to 64 bytes. It is memory of this rank alone, whose pixels must be sent, if it has at most 1536
+    // bytes, or if there is no (more) shared memory; a rank has 4 GiB of it. Any thread. Waits for nothing. Throws
     // OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
     using Reduce = dfb::Reduce;
 
     // Combines `values` element by element over all ranks, and returns the result on all. A sum that is too large wraps
-    // around. For figures of your own, or to find out on all ranks whether each could load its data. Collective.
+    // around. For example, to tell all ranks whether each could load its data. Collective.
     // Call it while no frame is open; this is not checked. Waits for all ranks, without a time-out: if one does not
     // call it, the others wait until that rank destroys its framebuffer or is lost. Throws InvalidArgument on every
     // rank if the numbers of values differ or a rank makes another collective call. Throws TransportError.
@@ -268,10 +268,10 @@ public:
         return engine().allReduce(values, how);
     }
 
-    // Returns the bytes of each rank, by rank, on all ranks. `call` is the name of this call in the error that is
-    // thrown if ranks make different calls. The sizes may differ and may be 0; each rank needs memory for the bytes of
-    // all, several times. Collective, call it as allReduce(). Waits and throws as that; also throws std::bad_alloc on a
-    // rank that lacks memory.
+    // Returns the bytes of each rank, by rank, on all ranks. `call` names this call in the error that is thrown if
+    // ranks make different calls. The sizes may differ and may be 0. Each rank needs several times the memory for all
+    // bytes. Collective, call it as allReduce(). Waits and throws as that; also throws std::bad_alloc on a rank that
+    // lacks memory.
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call = "allGather()")
     {
         return engine().allGather(bytes, call);

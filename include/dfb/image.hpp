@@ -66,25 +66,26 @@ inline std::size_t bytesPerPixel(OutputFormat format) noexcept
 
 // Converts `count` linear premultiplied RGBA pixels, double or float, to `format`, and writes bytesPerPixel(format)
 // bytes each to `out`, rounded to nearest. `out` must have room for them and not overlap `rgba`; for RGBA32F it is
-// aligned to floats. Any thread. Returns how far the worst value was from its level, in levels: 0 to 1/2, a tie. It may
-// be up to 2^-15 too large. sRGB colours count only next to a boundary, and then as a tie. 0 for RGBA32F and None.
+// aligned to floats. Any thread. Returns the largest distance of a value from its level, in levels: 0 to 1/2 (a tie).
+// The distance may be up to 2^-15 too large. sRGB colours count only next to a boundary between levels, and then as a
+// tie. 0 for RGBA32F and None.
 template <class Real>
 double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out);
 
 // convertPixels() with dithered colour, if the format has 8 bits; (x, y) is the place of the first pixel in the image.
 // Alpha is rounded, not dithered. A colour that is at most alpha gets at most the level that alpha would get as a
-// colour (ties go down). So in RGBA8 it stays at most alpha. This lowers it by half a level at most. Returns the
-// largest rounding distance of alpha, as convertPixels() does.
+// colour (ties go down). So in RGBA8 it stays at most alpha. This limit lowers a colour by half a level at most.
+// Returns the largest rounding distance of alpha, as convertPixels() does.
 template <class Real>
 double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int y, std::byte* out);
 
 // A whole image, row-major, without padding. Row 0 is the top row, or the lowest one after
-// ImageCompositor::setBottomUp(true). image() is empty on ranks other than the display rank, and with
-// OutputFormat::None.
+// ImageCompositor::setBottomUp(true). Several threads may call const members at once. Without pixels it is empty(), as
+// image() is on ranks other than the display rank and with OutputFormat::None.
 class Image {
 public:
     Image() = default;
-    // `channels`: those beside the colour. Throws OutOfMemory, which tells the bytes of the whole image.
+    // `channels`: those beside the colour. Throws OutOfMemory, which has the bytes of the whole image.
     Image(MemoryPool& pool, int width, int height, OutputFormat format, ChannelMask channels)
         : width_(width), height_(height), format_(format)
     {
@@ -197,8 +198,8 @@ private:
 // Writes the colours of an image to a file that most image viewers open: a PPM file, 8 bits a channel, without alpha.
 // RGBA32F becomes sRGB; 8-bit images are written as they are. Row 0 becomes the top row: after
 // ImageCompositor::setBottomUp(true) the file is upside down. Replaces an existing file. Not collective: call it on a
-// rank that has an image. Any thread. Throws InvalidArgument if the image is empty, and then writes nothing, or if the
-// file cannot be written, which may leave a part of it.
+// rank that has an image. Any thread. Throws InvalidArgument, with nothing written, if the image is empty; or if the
+// file cannot be written, of which a part may be left.
 DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image);
 
 DFB_NAMESPACE_END

@@ -48,9 +48,8 @@ struct InputImage {
     explicit InputImage(const std::uint8_t* bytes, const float* depths = nullptr) : rgba8(bytes), depth(depths) {}
     explicit InputImage(const float* floats, const float* depths = nullptr) : rgba32f(floats), depth(depths) {}
 
-    // Set one of these two. 8-bit colours are sent as bytes; level k means the float nearest to k / 255. Images that
-    // are encoded for a display (sRGB) are blended without decoding: ask for OutputFormat::RGBA8, which does not encode
-    // them a second time.
+    // Set one of these two. 8-bit colours are sent as bytes; level k means the float nearest to k / 255. Images in sRGB
+    // are blended without decoding them: ask for OutputFormat::RGBA8, which does not encode them again.
     const std::uint8_t* rgba8 = nullptr;
     const float* rgba32f = nullptr;
     const float* depth = nullptr;  // grows away from the camera
@@ -67,15 +66,15 @@ struct InputImage {
     // Pixels outside of this part of the picture are empty and not read. Its coordinates are those of `region`. By
     // default it is everything.
     Region valid{0, 0, std::numeric_limits<int>::max(), std::numeric_limits<int>::max()};
-    // A promise: the memory stays as it is until end() has returned. Then pixels need not be copied if their colours
-    // are premultiplied RGBA: a rank reads its own pixels where they lie, and those of other ranks of its node if they
-    // lie in memory of sharedMemory(). composite() sets it by itself.
+    // A promise: the pixels do not change until end() has returned. Premultiplied RGBA pixels then need not be copied:
+    // a rank reads its own pixels where they lie, and those of other ranks of its node if they lie in memory of
+    // sharedMemory(). composite() sets it by itself.
     bool staysUntilEnd = false;
 };
 
 // One object per rank. Construction, destruction, resize(), composite(), end(), imageOnAllRanks() and allGather() are
-// collective. One thread at a time may call members, except sharedMemory(). They work on all threads of
-// config.executor. Members that are not collective wait for no other rank, except that start() may wait for room.
+// collective. One thread at a time may call members, except sharedMemory(), which any thread may call. The work is done
+// on all threads of config.executor. Of the other members only start() may wait for other ranks, for room.
 class ImageCompositor {
 public:
     // Makes a compositor on a connection. config.image: the picture of the display rank. config.framesInFlight becomes
@@ -109,12 +108,12 @@ public:
     // same value on all ranks while no picture is open; nobody checks that. Waits for nothing.
     void setBottomUp(bool bottomUp) { bottomUp_ = bottomUp; }
 
-    // Makes one picture from the images of all ranks: start() and end() in one. `place` is this rank's place in the
-    // order of ImageBlend::InOrder: 0 is in front, and each rank gives a different one. Other blends ignore it. `frame`
-    // must have one pass and no samples. If config.executor was not given and this rank's share is one processor, the
+    // Makes one picture from the images of all ranks: start(), then end(). `place` is this rank's place in the order of
+    // ImageBlend::InOrder: 0 is in front, and each rank gives a different one. Other blends ignore it. `frame` must
+    // have one pass and no samples. If config.executor was not given and this rank's share is one processor, the
     // calling thread does all the work. Collective. Waits as end(). Throws what start() and end() throw.
     FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {});
-    // For ImageBlend::Nearest and ByDepth, which need no place; else as above.
+    // As above, for ImageBlend::Nearest and ByDepth, which need no place.
     FrameReport composite(const InputImage& image, const FrameConfig& frame = {})
     {
         return composite(image, -1, frame);
@@ -124,8 +123,8 @@ public:
     // each picture, then end(). The image's memory may be used again when this returns, unless you have promised
     // InputImage::staysUntilEnd. Waits for another rank only if this one has too much under way
     // (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open, if a field of `frame` is out of range,
-    // or on a thread that may not call MPI. Throws TransportError. If the image, `place`, or the samples in `frame` are
-    // wrong, end() throws on all ranks.
+    // or on a thread that may not call MPI. Throws TransportError. For a wrong image, `place` or number of samples
+    // end() throws, on all ranks.
     void start(const InputImage& image, int place, const FrameConfig& frame = {});
     void start(const InputImage& image, const FrameConfig& frame = {}) { start(image, -1, frame); }
     // In place of start(), on a rank that could not make its image: end() throws a FrameError with the text of `why`
@@ -143,8 +142,8 @@ public:
     }
 
     // Ends the picture. Collective. Waits until it is complete on the display rank, or has failed. Throws FrameError,
-    // the same on all ranks, after which the next picture can be made; TransportError; and InvalidArgument without
-    // start() or on a thread that may not call MPI.
+    // the same on all ranks, after which the next picture can be made. Throws TransportError. Throws InvalidArgument
+    // without start(), or on a thread that may not call MPI.
     FrameReport end();
 
     // The last picture, on the display rank, until the next start(). Empty on other ranks, before the first picture,
@@ -205,11 +204,12 @@ namespace detail {
 using BlendBySource = SortLast<BlendRule::InOrder, 64, colorChannel | depthChannel>;
 
 // On one node the tiles are strips, as wide as the picture (at most 4096 pixels). A strip is one piece of memory in
-// each image. Square tiles of as many pixels touch a page of memory for each of their rows, which takes up to 1.5 times
-// as long. 4 strips a rank share the work well enough. A strip of under 4096 pixels costs more to send than to blend.
+// each image. A square tile of as many pixels touches a page of memory for each of its rows, which takes up to 1.5
+// times as long. 4 strips a rank share the work well enough. Smaller strips than 4096 pixels cost more to send than to
+// blend.
 //
 // Between nodes, sent bytes cost more than touched pages. Tiles are square there, and small compared with most images.
-// So many tiles have pixels of one rank alone, which owns them and sends their pixels once.
+// So many tiles have pixels of one rank alone. That rank owns them, and their pixels are sent only once.
 template <class TileOp>
 std::unique_ptr<Operations> imageOperations(const char* name, const ImageConfig& image, int ranks, bool isOneNode)
 {
@@ -469,8 +469,7 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
 
 DFB_COMPILED_ONCE FrameReport ImageCompositor::composite(const InputImage& image, int place, const FrameConfig& frame)
 {
-    // On one processor, this thread has to wait here anyway. So it does all the work, including that of the progress
-    // thread.
+    // On one processor this thread does all the work, including the progress thread's, as it has to wait anyway.
     std::optional<Connection::StandIn> standIn;
     const auto wake = [](ThreadExecutor* threads) { threads->rest(false); };
     const std::unique_ptr<ThreadExecutor, decltype(wake)> resting(oneThread_.get(), wake);

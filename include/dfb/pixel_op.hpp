@@ -2,7 +2,7 @@
 // output format (section 3.1.2 of the paper).
 //
 // A PixelOp is a copyable type. Each rank keeps one copy for each frame in flight, and calls process() for several
-// tiles at once. An exception makes the frame fail on all ranks, with its text.
+// tiles at once, on any thread. An exception makes the frame fail on all ranks; the error has its text.
 //
 //   void process(PixelTile&) const;              changes the pixels, sends them elsewhere, ...
 //
@@ -70,9 +70,9 @@ struct NoPixelOp {
 };
 static_assert(is_pixel_op_v<NoPixelOp>);
 
-// Exposure, then Reinhard's global operator on the colour divided by alpha: c -> k c / (1 + k c), c = colour / alpha
-// (Reinhard et al., "Photographic Tone Reproduction for Digital Images", 2002, equation 3). Alpha stays. In pixels
-// whose alpha is 0, 1 is used in its place, so that emission is kept.
+// Exposure k, then Reinhard's global operator: c -> k c / (1 + k c), where c is colour / alpha (Reinhard et al.,
+// "Photographic Tone Reproduction for Digital Images", 2002, equation 3). Alpha stays. Where alpha is 0, c is the
+// colour itself, so that emission is kept.
 struct ToneMap {
     static constexpr bool pointwise = true;
     struct FrameData {

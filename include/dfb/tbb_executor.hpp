@@ -17,8 +17,8 @@ DFB_NAMESPACE_BEGIN
 // its cores; the thread that calls parallelFor() takes part.
 class TbbExecutor final : public Executor {
 public:
-    // `threadCount` 0: one thread for each processor that oneTBB finds for this process. Where several ranks share the
-    // processors, that is too many: see Connection::threadShare().
+    // `threadCount` 0: one thread for each processor that oneTBB finds for this process. That is too many if several
+    // ranks share the processors: see Connection::threadShare(). Throws what oneTBB throws.
     explicit TbbExecutor(int threadCount = 0) : arena_(threadCount > 0 ? threadCount : tbb::task_arena::automatic, 1)
     {
         arena_.initialize();

@@ -26,12 +26,12 @@ struct TileHeader {
     int children = 0;         // how many inputs of generation + 1 this one announces
     std::uint32_t source = 0; // brick id, or another number; where there are no bricks, the rank
     std::uint16_t part = 0;   // to tell apart several inputs of one source
-    // For renderers: the number of this sample over all frames that accumulate, a seed for random numbers. Set by
-    // Frame::start. 0 in the inputs of a tile operation: there the number is TileInfo::firstSample + pass.
+    // For renderers, as a seed of random numbers: the number of this sample, over all frames that accumulate. Set by
+    // Frame::start. It is 0 in the inputs of a tile operation, where TileInfo::firstSample + pass is the number.
     int sample = 0;
 };
 
-// An order of the sources of inputs, from front to back.
+// An order of the sources of inputs, from front to back. Any thread may read it.
 class SourceOrder {
 public:
     // Throws InvalidArgument if a source comes twice.
@@ -52,7 +52,7 @@ public:
     // Sorted by ascending source.
     const std::vector<Place>& places() const noexcept { return places_; }
 
-    // Returns -1 if the source is not in the order.
+    // The place of a source, 0 in front; -1 if it is not in the order.
     int placeOf(std::uint32_t source) const noexcept
     {
         const auto at = std::lower_bound(places_.begin(), places_.end(), source,
@@ -72,7 +72,7 @@ constexpr std::size_t pixelsOf(int tileSize)
 }
 
 // Returns `array`. GCC 12.2 at -O2 drops the calls of a function that fills two arrays of one struct in nested loops,
-// as if it wrote nothing. It does not if it cannot tell where one of the pointers comes from.
+// as if it wrote nothing. This hides from GCC where one of the pointers comes from: then it keeps the calls.
 inline float* unknownOrigin(float* array) noexcept
 {
 #if defined(__GNUC__) && !defined(__clang__)
@@ -173,7 +173,8 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, detail::pixelsOf(Size)> {
     using detail::TilePlanes<Channels, detail::pixelsOf(Size)>::color;
 
     Tile() = default;
-    // Explicit: a renderer that takes `auto tile` in place of `auto& tile` would fill a copy, and does not compile.
+    // Explicit, so that a renderer that takes `auto tile` in place of `auto& tile`, and so would fill a copy, does not
+    // compile.
     explicit Tile(const Tile&) = default;
     Tile(Tile&&) = default;
     Tile& operator=(const Tile&) = default;
@@ -238,9 +239,9 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, detail::pixelsOf(Size)> {
     }
 };
 
-// A tile whose pixels lie elsewhere in host memory, such as in an image that a renderer has made by itself. They are
-// read there and mean what those of a Tile mean. All pointers point to the first pixel of the region; channels that
-// neither the operation nor the image needs may be null. A tile without colour is empty.
+// A tile whose pixels lie elsewhere in host memory, such as in a renderer's own image. They are read there, and have
+// the meaning of a Tile's. All pointers point to the first pixel of the region. Channels that neither the operation nor
+// the image needs may be null. A tile without colour is empty.
 template <ChannelMask Channels, int Size>
 struct TileView : TileHeader {
     static constexpr int size = Size;
@@ -248,22 +249,23 @@ struct TileView : TileHeader {
 
     std::ptrdiff_t stride = 0; // from a row to the next, in pixels; negative where rows lie bottom-up
     const float *color = nullptr, *depth = nullptr, *normal = nullptr, *albedo = nullptr, *position = nullptr;
-    // In place of `color`, which counts if both are set: premultiplied linear RGBA of 8 bits a channel, level / 255. It
-    // is sent as it is, a byte a channel, and composited exactly.
+    // In place of `color`: premultiplied linear RGBA of 8 bits a channel, level / 255. If both are set, `color` is
+    // used. The bytes are sent as they are, and composited exactly.
     const std::uint8_t* color8 = nullptr;
     const std::uint32_t *primitiveId = nullptr, *instanceId = nullptr;
     const float* farDepth = nullptr;
-    // Pixels of the image outside of this region are empty, and are not read. Set it in a renderer that knows where its
-    // data project to. By default there is no such limit.
+    // Pixels of the image outside of this region are empty, and are not read. Set it if you know where your data
+    // project to. By default there is no limit.
     Region valid{std::numeric_limits<int>::min(), std::numeric_limits<int>::min(), std::numeric_limits<int>::max(),
                  std::numeric_limits<int>::max()};
     Region validRegion() const noexcept { return intersection(region, valid); }
     // A promise: the pixels do not change until the frame's end() has returned. Then they need not be copied. They are
     // read in place if this rank owns the tile, or if the owner is on the same node and they are in memory of
-    // sharedMemory(). They are nevertheless copied if the operation has no readsInPlace or keeps state, if a channel
-    // other than colour and depth is sent, or with a WireFormat that rounds, an ErrorBudget, minTransmittance above 0,
-    // or HalfLevel for an 8-bit image if not all ranks share memory. After a TransportError do not write to such memory
-    // until the framebuffer is destroyed. NetworkConfig::checksums finds broken promises.
+    // sharedMemory(). They are copied all the same if the operation has no readsInPlace or keeps state, or if a channel
+    // other than colour and depth is sent. So they are with a WireFormat that rounds, with an ErrorBudget, with
+    // minTransmittance above 0, and with HalfLevel for an 8-bit image if not all ranks share memory. After a
+    // TransportError do not write to such memory until the framebuffer is destroyed. NetworkConfig::checksums finds
+    // broken promises.
     bool staysUntilEnd = false;
 
     detail::ConstPlanes planes() const noexcept
@@ -286,8 +288,8 @@ struct TileView : TileHeader {
 
 namespace detail {
 
-// A Tile or a TileView of any size and channels: its header, and where its pixels lie. Nothing inside the framebuffer
-// is a template on the type of a tile.
+// A Tile or a TileView of any size and channels: its header, and where its pixels lie. So nothing inside the
+// framebuffer is a template on the type of a tile.
 struct InputPixels : TileHeader {
     template <ChannelMask Channels, int Size>
     InputPixels(const Tile<Channels, Size>& from)

@@ -75,8 +75,9 @@ private:
     int tilesX_ = 0, tilesY_ = 0;
 };
 
-// Names the rank in [0, rankCount) that owns a tile. A pure function, the same on all ranks. The constructor of a
-// framebuffer and resize() call it for each tile, and throw InvalidArgument on all ranks if it throws or names no rank.
+// Returns the rank in [0, rankCount) that owns a tile. A pure function, the same on all ranks. The constructor of a
+// framebuffer and resize() call it for each tile. They throw InvalidArgument on all ranks if it throws or returns no
+// rank.
 using OwnerMap = std::function<int(int tile, const TileLayout& layout, int rankCount)>;
 
 // The rank that owns each tile, by the tile's index.
@@ -85,8 +86,9 @@ using TileOwners = std::shared_ptr<const std::vector<int>>;
 // See FrameBufferConfig::onTile.
 using TileCallback = std::function<void(int tile, const Region& pixels, const Image& image)>;
 
-// The default: each tile row is the one above it, shifted by about 0.62 of the rank count, so that neighbours in both
-// directions belong to different ranks. (With tile % rankCount a rank would own whole columns of many images.)
+// The default. The owners of a tile row are those of the row above, shifted by about 0.62 of the rank count. So
+// neighbours in both directions belong to different ranks. (With tile % rankCount a rank would own whole columns of
+// many images.)
 inline int latticeOwner(int tile, const TileLayout& layout, int rankCount)
 {
     int shift = std::max(1, static_cast<int>(0.618 * rankCount));
@@ -115,8 +117,7 @@ inline int hashOwner(int tile, const TileLayout&, int rankCount)
 // WallLayout: where the displays of a wall are, and which ranks drive them.
 //
 // The displays have one size and stand in columns and rows. They are numbered row by row, from 0 at the upper left. The
-// framebuffer has the pixels of all of them and those behind the bezels between them, so that a line that crosses a
-// bezel goes on straight.
+// framebuffer also has the pixels behind the bezels between them, so that a line that crosses a bezel goes on straight.
 struct WallLayout {
     int columns = 1, rows = 1;
     int displayWidth = 0, displayHeight = 0; // pixels

@@ -2,13 +2,13 @@
 //
 // A TileOp is a default-constructible type. The owner of a tile makes one object of it for each frame in flight, when
 // the tile first needs it. If owners change, an object without keepsState may serve another tile later. Calls for one
-// tile come one after the other, from any thread, so the operation needs no mutex; calls for different tiles may come
-// at once. It does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks, with
-// its text.
+// tile come one after the other, from any thread, so the operation needs no mutex. Calls for different tiles may come
+// at once. It does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks; the
+// error has its text.
 //
-// All passes of a tile come to one object. The operation itself composites each pass (TileHeader::pass), lays each over
-// TileInfo::background, and averages them; PassImages does the last two. Inputs come in any order. Empty ones come,
-// too: see Fragment::empty().
+// All passes of a tile come to one object. The operation composites each pass (TileHeader::pass) by itself, lays it
+// over TileInfo::background, and averages the passes; PassImages does the last two. Inputs come in any order. Some are
+// empty: see Fragment::empty().
 //
 //   static constexpr ChannelMask channels;       the channels its inputs have (Tile<channels, tileSize>)
 //   void newFrame(const TileInfo&);              forget the last frame; or, with a FrameData,
@@ -93,13 +93,13 @@ struct AuxRow {
     const std::uint32_t* instanceId = nullptr;
 };
 
-// Where a TileOp writes its result, row by row; the rows are rounded to the output format on the way. Use it only
-// within TileOp::finish(), on the thread of that call. Members that set pixels throw InvalidArgument, with nothing set,
-// for pixels outside the region.
+// Takes the result of a TileOp, row by row, and rounds it to the output format. Use it only within TileOp::finish(), on
+// the thread of that call. Waits for nothing. Members that set pixels throw InvalidArgument, with nothing set, for
+// pixels outside the region.
 class FinishedTile {
 public:
     // `to` points to pixel (0, 0) of the region in each plane that is wanted. Rows are `stride` pixels apart; colour is
-    // in `format`. `background`: which of these pixels are known to be background; may be null.
+    // in `format`. `background`: which of these pixels already show the background; may be null.
     FinishedTile(const Region& region, OutputFormat format, const detail::Planes& to, std::size_t stride,
                  bool dither = false, detail::BackgroundPixels* background = nullptr)
         : region_(region), format_(format), to_(to), stride_(stride), dither_(dither && bytesPerPixel(format) == 4),
@@ -226,7 +226,7 @@ public:
         color_.assign(4 * pixels_ * passes_, 0.0);
     }
 
-    // The index of a pixel, 0 to count() - 1; also for arrays of other values that an operation keeps for each pixel.
+    // The index of a pixel, 0 to count() - 1. An operation can use it for its own arrays, too.
     // `pass` is TileHeader::pass; x and y count from the tile's upper left corner.
     std::size_t index(int pass, int x, int y) const noexcept
     {
@@ -262,7 +262,7 @@ private:
     std::vector<double> color_;
 };
 
-// Figures of a finished tile, which a TileOp sets in report() if it has that member.
+// Figures of a finished tile: TileOp::report() sets them.
 struct TileReport {
     double error = -1;                     // how far the tile's pixels may be off, in units of colour; < 0: not known
     std::int64_t orderUndefinedPixels = 0; // pixels whose inputs overlap in depth, so that no order is right

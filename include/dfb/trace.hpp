@@ -25,7 +25,7 @@ struct TraceEvent {
         Input,   // an input is taken by the owner of its tile: TileOp::add(). peer: whose message it is, or -1
         Finish,  // tile operation and pixel operation of a tile, whose pixels go into the image or into a message
         Send,    // a message is given to the transport. peer: its receiver
-        Receive, // a message is handled, which may have waited in the inbox. peer: its sender
+        Receive, // a message from the inbox is handled. peer: its sender
         Wait     // for room, for a reduction such as the verdict, or for another rank. Other work may be within it
     };
 

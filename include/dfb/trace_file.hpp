@@ -100,9 +100,9 @@ private:
             }
     }
 
-    // No message is received before it is sent. So each message limits how far the clock of one rank can be ahead of
-    // another's, and so does a chain of messages. Chains from and to rank 0 give each rank a lower and an upper limit.
-    // The middle between these satisfies all limits.
+    // No message is received before it is sent. So each message, and each chain of messages, limits how far the clock
+    // of one rank can be ahead of another's. Chains from and to rank 0 give each rank a lower and an upper limit. The
+    // middle of both satisfies all limits.
     void alignClocks()
     {
         std::map<std::pair<std::size_t, std::size_t>, Duration> shortest; // by sender and receiver
@@ -157,8 +157,8 @@ private:
                 out << printed(",\n{\"ph\": \"M\", \"name\": \"thread_name\", \"pid\": %d, \"tid\": %d, \"args\": "
                                "{\"name\": \"%s %d\"}}",
                                pid, row, isThread ? "thread" : "frames", isThread ? r.thread : row);
-            // Viewers add the duration to the begin, and round. 1 ns less keeps a span from overlapping one that begins
-            // when it ends.
+            // Viewers add the duration to the begin, and round. 1 ns less keeps this span from overlapping the next
+            // one.
             const bool isPart = e.kind != TraceEvent::Kind::Frame && e.end > e.begin;
             const Duration lasts = e.end - e.begin - std::chrono::nanoseconds(isPart ? 1 : 0);
             out << ",\n{\"ph\": \"X\", \"name\": \"" << nameOf(e) << '"' << place(rank, row, e.begin)
@@ -236,8 +236,8 @@ private:
 
 } // namespace detail
 
-// One object per rank, for the framebuffers of one connection. Their frames are not told apart: each framebuffer counts
-// its own from 1.
+// One object per rank, for the framebuffers of one connection. Frames of different framebuffers may have the same
+// number, as each framebuffer counts from 1.
 class TraceFile final : public TraceSink {
 public:
     // Keeps up to `capacity` events, 64 bytes each, in memory that it allocates now. Later events are only counted.
@@ -258,11 +258,11 @@ public:
         ++dropped_;
     }
 
-    // Writes the file on rank 0, with the messages of this call, and forgets the events, even if that fails.
-    // Collective, outside frames, on the thread that begins frames. Waits for all ranks, without a time-out. `fb`: one
-    // of the framebuffers, or an ImageCompositor. Rank 0 needs memory for the events of all ranks, each other rank for
-    // those of one more. Throws InvalidArgument on all ranks if the file cannot be written; TransportError; and
-    // std::bad_alloc on a rank that lacks memory.
+    // Writes the file on rank 0, and forgets the events, even if that fails. The file also has the messages of this
+    // call. Collective, outside frames, on the thread that begins frames. Waits for all ranks, without a time-out.
+    // `fb`: one of the framebuffers, or an ImageCompositor. Rank 0 needs memory for the events of all ranks, each other
+    // rank for those of one more. Throws InvalidArgument on all ranks if the file cannot be written. Throws
+    // TransportError, and std::bad_alloc on a rank that lacks memory.
     template <class FrameBuffer>
     void write(FrameBuffer& fb, const std::string& path)
     {

@@ -11,8 +11,7 @@
 
 // Everything stands in an inline namespace named after the version, such as dfb::v0_2. A program writes dfb::Image. If
 // a process contains two versions, for example in two plugins, neither calls the functions of the other. Versions that
-// differ only in the patch share the namespace: a patch changes neither a class's layout nor what an inline function
-// does in a way that the older one could not take part in.
+// differ only in the patch share the namespace: their classes and inline functions work together.
 #define DFB_NAMESPACE_OF_(major, minor) v##major##_##minor
 #define DFB_NAMESPACE_OF(major, minor) DFB_NAMESPACE_OF_(major, minor)
 // clang-format off
