@@ -7,8 +7,8 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Expects one input per pass, of generation 0 and without children. The tile is laid over the background, passes are
-// averaged. Channels beside colour travel only if the image has them.
+// Expects one input per pass, of generation 0 and without children; others make the frame fail. Lays it over the
+// background, and averages the passes. Channels beside colour travel only if the image has them.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicImageParallel : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:

@@ -1,5 +1,5 @@
-// Progressive: accumulates the pixels of another operation over the passes of many frames, and says how far the mean
-// may be off (section 4.1.1 of the paper).
+// Progressive: accumulates the pixels of another operation over the passes of many frames, and estimates the error of
+// the mean (section 4.1.1 of the paper).
 #pragma once
 
 #include <dfb/ops/sort_last.hpp>
@@ -17,8 +17,8 @@ DFB_NAMESPACE_BEGIN
 namespace detail {
 
 // Returns by how much M2 (the sum over 4 channels of squared deviations from the mean) grows when `sample` joins `n`
-// samples that have this sum. This is the pairwise formula of Chan, Golub and LeVeque (1979), which is free of
-// cancellation, however large the mean is beside the spread.
+// samples that have this sum. The pairwise formula of Chan, Golub and LeVeque (1979): it has no cancellation, even if
+// the mean is large beside the spread.
 inline double growthOfM2(std::int64_t n, const double* sum, const double* sample) noexcept
 {
     if (n == 0)
@@ -47,8 +47,8 @@ inline double growthOfM2(std::int64_t n, const double* sum, const double* sample
 // With FrameConfig::samples, TileSamples::first of a tile must be the number of samples that it has already, or 0,
 // which begins again. A tile without samples in a frame costs nothing and keeps its pixels. TileReport::error is the
 // standard error of the mean of a finished tile: the root mean square over pixels and RGBA in the worst of its blocks
-// of 8x8 pixels, so that a bright corner counts however dark the rest is. It is infinite before the second sample.
-// Memory: 45 bytes for each pixel of a tile that this rank owns and that had an input; 56 more with normals and albedo.
+// of 8x8 pixels. So a bright corner counts even in a dark tile. The error is infinite before the second sample. Memory:
+// 45 bytes for each pixel of a tile that this rank owns and that had an input; 56 more with normals and albedo.
 template <class Base>
 class Progressive {
 public:

@@ -55,8 +55,8 @@ public:
         nearest(aux_.instanceId, row.aux.instanceId);
     }
 
-    // Adds `count` samples without an input to all pixels. That equals adding them one by one, as sums of so many equal
-    // floats are exact.
+    // Adds `count` samples without an input to all pixels. The result is that of adding them one by one, as these sums
+    // of equal floats are exact.
     void addBackground(std::int64_t count, const std::array<float, 4>& background)
     {
         for (std::size_t i = 0; count > 0 && i < rgba_.size(); ++i)
@@ -126,8 +126,8 @@ public:
 
     void report(TileReport& report) const { report.orderUndefinedPixels = undefinedPixels_; }
 
-    // For operations on top of this one: calls passDone(y, pass, row) for each row and pass, row by row, with the
-    // background below.
+    // For operations on top of this one: calls passDone(y, pass, row) for each row and pass, row by row. The row has
+    // its background.
     void compositePasses(const FunctionRef<void(int, int, const CompositeRow&)>& passDone);
 
 protected:
@@ -191,11 +191,11 @@ public:
 
 } // namespace detail
 
-// Sorts the inputs of each pixel by (depth, source, part). Accepts any dependency tree (dependency_tracker.hpp).
-// Empty inputs count in the tree and are not blended. Accuracy: see blend/compositing.hpp; the mean over
-// n passes adds at most n * 2^-53 relative. With farChannel, pixels in which inputs overlap in depth are counted, since
-// their order is undefined. Channels beside colour, depth and farChannel travel only if the image has them. With
-// FrameConfig::order, inputs are blended in that order, without a sort; not with farChannel.
+// Sorts the inputs of each pixel by (depth, source, part). Accepts any dependency tree (dependency_tracker.hpp). Empty
+// inputs count in the tree and are not blended. Accuracy: see blend/compositing.hpp; the mean over n passes adds a
+// relative error of at most n * 2^-53. With farChannel, it counts pixels in which inputs overlap in depth, since their
+// order is undefined. Channels beside colour, depth and farChannel travel only if the image has them.
+// FrameConfig::order replaces the sort, except with farChannel.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicAlphaBlend : public detail::SortLast<BlendRule::SortByDepth, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: AlphaBlend sorts by depth");
@@ -207,11 +207,11 @@ public:
 
 // Blends inputs in the order of their generation, front to back. Use it if one order of the bricks is right for all
 // pixels of a tile. It sorts nothing, and no depth travels unless the image has it. The tree is a list: each input
-// announces one child, the last none. A tile that no brick covers needs an empty input of generation 0, which
-// OrderedLoop sends. If several declared inputs have one generation, they are blended by (source, part).
+// announces one child, the last none. OrderedLoop sends an empty input of generation 0 for a tile that no brick covers.
+// Declared inputs of one generation are blended by (source, part).
 //
-// In a tile with one pass, if the image has colour alone, inputs behind an opaque one are not blended, and the tile
-// does not wait for them.
+// If a tile has one pass, and the image colour alone, the tile does not wait for inputs behind an opaque one, nor blend
+// them.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicOrderedBlend : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:
@@ -234,9 +234,8 @@ public:
                                  fragment.header().children);
         const int generation = fragment.header().generation;
         const bool hides = opaqueHides(Base::info());
-        // If no input hides others, the dependency tracker reports this error at the end. Here it is checked early, as
-        // the tile may be finished before that. Several declared inputs may be of generation 1: then generation 0 never
-        // comes.
+        // The dependency tracker finds this error at the end. But a tile in which an input hides others may be finished
+        // before that. Several declared inputs may be of generation 1: then generation 0 never comes.
         if (hides && generation != 1 && has(generation))
             detail::failArgument("inputs in order form a list: there cannot be two of generation %d", generation);
         generations_.push_back(generation);
@@ -272,9 +271,9 @@ private:
 };
 
 // Keeps the nearest input of each pixel, by (depth, source, part); for opaque geometry. A pixel is active if its depth
-// is below +infinity, even if it is black or transparent; without a depth it is empty, whatever its colour. The nearest
-// input is laid over the background by its alpha; inputs behind it are not blended. Depth, position and ids are those
-// of the nearest input. Accepts any tree.
+// is below +infinity, even if it is black or transparent. Otherwise it is empty, whatever its colour. The nearest input
+// is laid over the background by its alpha; inputs behind it are not blended. Depth, position and ids are those of the
+// nearest input. Accepts any tree.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicDepthComposite : public detail::SortLast<BlendRule::Nearest, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: DepthComposite compares depths");
@@ -462,8 +461,8 @@ DFB_COMPILED_ONCE void FragmentStore::finishRuns(FinishedTile& out)
     }
 }
 
-// Finishes a tile of DepthComposite whose inputs have 8 bits a channel. An image of 8 bits gets their pixels as they
-// are where no background shows through.
+// Finishes a tile of DepthComposite whose inputs have 8 bits a channel. Where no background shows through, an RGBA8
+// image gets their pixels as they are.
 DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
 {
     Scratch& scratch = start();
@@ -509,8 +508,8 @@ DFB_COMPILED_ONCE void FragmentStore::finishLevels(FinishedTile& out)
     }
 }
 
-// Rounds a row again, in twice the precision, where double does not tell which 8-bit level is nearer. Not with a
-// minTransmittance: another precision could end a pixel at another layer. `farthest`: the result of setRow() or
+// Rounds a row again, in twice the precision, where double does not tell which 8-bit level is nearer. Does nothing with
+// a minTransmittance: in another precision a pixel could end at another layer. `farthest`: the result of setRow() or
 // setPixels(). Call it after start().
 DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, double farthest)
 {

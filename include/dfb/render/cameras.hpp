@@ -1,7 +1,7 @@
 // Cameras beyond the pinhole: matrices, depth of field, stereo, domes, motion blur (section 4.2 of the paper). ray() is
-// the ray through a point of the image, with sample numbers for lens and time. project() says which pixels a box may
-// cover. Compute the sample numbers from pixel, sample and seed alone: then all bricks are seen along the same ray.
-// Each sample is a pass. Any thread may call any member, several at once.
+// the ray through a point of the image; for some cameras it depends on sample numbers for lens and time. project() says
+// which pixels a box may cover. Compute the sample numbers from pixel, sample and seed alone: then all bricks are seen
+// along one ray. Each sample is a pass. Any thread may call any member, several at once.
 //
 // Points of the image are in pixels, pixel centres at .5; sample numbers are in [0, 1); angles in degrees.
 #pragma once
@@ -81,7 +81,7 @@ public:
         return {toFloat(meetingPoint(column, row, nearPlane())), toFloat(direction)};
     }
 
-    // Returns what the box may cover: the whole image if it reaches behind the eye, nothing if all of it is behind.
+    // Returns the pixels that the box may cover: all if it reaches behind the eye, none if all of it is behind.
     Footprint project(const Box3& bounds, int width, int height) const
     {
         const Plane& w = rows_[3];
@@ -131,8 +131,8 @@ private:
     bool isOrthographic_ = false;
 };
 
-// Depth of field: points at `focusDistance` along the view are sharp; `apertureRadius` is that of the lens, in units of
-// the world.
+// Depth of field. Points at `focusDistance` along the view are sharp; `apertureRadius` is the radius of the lens. Both
+// are in units of the world.
 class ThinLensCamera {
 public:
     // As PerspectiveCamera::along(). The distance may be infinite. Also throws InvalidArgument if the radius is below 0
@@ -164,8 +164,8 @@ private:
     double radius_, focus_;
 };
 
-// Two eyes side by side: the left half of the image shows what the left eye sees, the right half what the right eye
-// sees. The eyes are `separation` apart. A point at `convergence` along the view is at the same place in both halves.
+// Two eyes side by side: each half of the image shows the view of the eye on that side. The eyes are `separation`
+// apart, in units of the world. A point at `convergence` along the view is at the same place in both halves.
 class StereoCamera {
 public:
     // As PerspectiveCamera::along(); `fovY` is that of each half. `convergence` may be infinite: the eyes then look in
@@ -235,10 +235,10 @@ public:
 
     std::optional<Vec3> commonEye() const { return toFloat(pose_.eye); }
 
-    // Returns the image of a sphere around the box, widened to an octagon; the whole image if the eye is in the sphere
-    // or the box is near the point behind the eye; nothing if the box is outside the dome. Distances along a radius of
-    // the image are proportional to angles. Distances across the radius, at the angle theta off the view, are stretched
-    // by theta / sin(theta).
+    // Returns an octagon around the image of a sphere around the box. Returns the whole image if the eye is in the
+    // sphere or the box is near the point behind the eye, and nothing if the box is outside the dome. Distances along a
+    // radius of the image are proportional to angles. Distances across the radius, at the angle theta off the view, are
+    // stretched by theta / sin(theta).
     Footprint project(const Box3& bounds, int width, int height) const
     {
         const Vec3d lower = detail::cornerOf(bounds, 0), upper = detail::cornerOf(bounds, 7);
@@ -292,9 +292,9 @@ public:
         return {toFloat(pose.eye), toFloat(normalize(pose.through(x, y, width, height)))};
     }
 
-    // Returns a footprint for each part of the time that the shutter is open. Turning the camera moves the image as
-    // turning the world the other way does. So a point at distance rho from the axis is never farther than rho times
-    // half the part's angle from its place in the middle of that part.
+    // Returns a footprint for each of some parts of the time that the shutter is open. If the camera turns, the image
+    // moves as if the world turned the other way. So a point at distance rho from the axis is never farther from its
+    // place in the middle of a part than rho times half the part's angle.
     std::vector<Footprint> project(const Box3& bounds, int width, int height) const
     {
         double rho = 0;

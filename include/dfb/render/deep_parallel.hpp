@@ -1,5 +1,5 @@
-// DeepParallelLoop: data-parallel rendering with several segments per pixel, so that bricks need not be convex and may
-// be interleaved (A before B before A along a ray).
+// DeepParallelLoop: data-parallel rendering with several segments per pixel. So bricks need not be convex, and may be
+// interleaved (A before B before A along a ray).
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -26,18 +26,19 @@ struct Segment {
     float depth = 0, farDepth = 0;
 };
 
-// A tile whose pixels may have several segments, all of one brick. A segment is what the brick contributes along one
-// piece of a ray. Other bricks may have segments in the gaps between them. A pixel keeps at most `maxSegments`, which
-// bounds memory and messages. If one more is added, two neighbours are merged: those whose merge may change the pixel
-// least. A merge is exact if no other brick lies between the two. Otherwise the layer between them (c', a') is blended
-// behind both. This puts the pixel off by T |c' a2 - c2 a'|, where (c2, a2) is the farther of the two, and T is the
-// part of the light that passes the brick's segments in front of it. This is at most T max(a2, |c2|) for colours with
-// c' <= a' <= 1. The sum over all merges bounds the error of a pixel: errorBound(). Where c' is more than a', multiply
-// it by the largest c' / a'.
+// A tile whose pixels may have several segments, all of one brick. A segment is the brick's colour along one piece of a
+// ray. Other bricks may have segments in the gaps between them. A pixel keeps at most `maxSegments`, which bounds
+// memory and messages. If one more is added, two neighbours are merged: those whose merge may change the pixel least.
+//
+// The error of a merge: it is exact if no other brick lies between the two. Otherwise the layer between them, with
+// colour c' and alpha a', is blended behind both. Let the farther of the two have colour c2 and alpha a2, and let T be
+// the part of the light that passes all segments of the brick in front of it. The error is then T |c' a2 - c2 a'|: at
+// most T max(a2, |c2|) if c' <= a' <= 1. The sum over all merges bounds the error of a pixel: errorBound(). For colours
+// with c' > a', multiply it by the largest c' / a'.
 class DeepTile {
 public:
-    // `maxSegments`: segments a pixel, 1 to 65535. Less counts as 1, more as 65535. Each pixel has room for the most
-    // that one has had. One thread at a time may use the tile.
+    // `maxSegments`: segments a pixel, 1 to 65535. Less counts as 1, more as 65535. All pixels have equal room, which
+    // doubles when one needs more. One thread at a time may use the tile. reset() and add() throw std::bad_alloc.
     explicit DeepTile(int maxSegments) : maxSegments_(std::clamp(maxSegments, 1, 65535)) {}
 
     int maxSegments() const noexcept { return maxSegments_; }
@@ -89,8 +90,8 @@ public:
     // How much merging may have changed a pixel, at most: see DeepTile.
     double errorBound() const noexcept { return errorBound_; }
 
-    // Writes segment `layer` of each pixel, counted from 0 at the front, into a cleared tile of the same region; pixels
-    // with fewer segments stay empty. Nobody checks that `layer` is 0 or more and that the regions are equal.
+    // Writes segment `layer` of each pixel, counted from 0 at the front, into a cleared tile of the same region. Pixels
+    // with fewer segments stay empty. Not checked: `layer` is 0 or more, and the regions are equal.
     template <class TileType>
     void writeLayer(int layer, TileType& tile) const
     {
@@ -186,8 +187,8 @@ public:
 
     // As DataParallelLoop::start(), but renderBrick(brick, deep) adds the segments of the pixels of
     // deep.header().region to the empty DeepTile. FrameReport::mergeErrorBound says how far a pixel may be off because
-    // segments were merged. The first segments of a brick's pixels announce the others as children, so pixels with one
-    // segment cost nothing extra.
+    // segments were merged. A brick whose pixels all have one segment in a tile sends one input, as in
+    // DataParallelLoop.
     template <class Camera, class RenderBrick>
     typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick, FrameConfig params = {},
                                       const typename FrameBuffer::TileFrameData& tileData = {},

@@ -1,5 +1,5 @@
-// LinkOwners: gives the tiles of a frame to ranks so that few bytes go from node to node, and no link carries many more
-// than the others.
+// LinkOwners: picks owners for the tiles of a frame, so that few bytes go from node to node, and no link carries many
+// more than the others.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
@@ -31,7 +31,7 @@ public:
             ranksOf_[static_cast<std::size_t>(nodeOf[rank])].push_back(static_cast<int>(rank));
     }
 
-    // On one node, any owner is as near to the pixels as another.
+    // On one node all ranks are equally near to the pixels.
     bool isOneNode() const { return ranksOf_.front().size() == nodeOf_.size(); }
 
     void start(const TileLayout& layout)
@@ -41,7 +41,7 @@ public:
         tiles_.assign(static_cast<std::size_t>(layout.tileCount()), {});
     }
 
-    // Some pixels of a tile come from one of `rankCount` ranks; nobody knows from which. Takes the least memory if the
+    // Some pixels of a tile come from one of `rankCount` ranks; it is not known which. Takes the least memory if the
     // ranks of a node come one after the other, as in byNode().
     void add(int tile, const Region& pixels, const int* ranks, std::size_t rankCount)
     {
@@ -95,7 +95,8 @@ private:
 
     void place(Tile& tile, double area);
 
-    // Adds what the tile in from_ loads the links with, if the owner is on `node`; or, with sign -1, takes it away.
+    // Adds the bytes of the tile in from_ to the links' loads, if its owner is on `node`; with sign -1, takes them
+    // away.
     void carry(int node, double input, double finished, int sign)
     {
         for (const int source : from_)

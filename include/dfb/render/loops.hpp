@@ -36,10 +36,10 @@ struct InPlace {
     }
 };
 
-// Makes a renderer for any loop except DeepParallelLoop out of pixels that are there already, such as an image that a
-// rank has made by itself. find(brick, view), or find(view) for ImageParallelLoop, points the planes of a TileView to
-// the pixels of view.region; a view left without colour is empty. Several threads call it at once. Pixels are copied
-// before find() is called again on the same thread, so it may reuse their memory, unless it sets staysUntilEnd.
+// Makes a renderer, for any loop except DeepParallelLoop, from pixels that exist already, such as a rank's own image.
+// find(brick, view), or find(view) for ImageParallelLoop, points the planes of a TileView to the pixels of view.region;
+// a view left without colour is empty. Several threads call it at once. Pixels are copied before find() is called again
+// on the same thread, so it may reuse their memory, unless it sets staysUntilEnd.
 template <class Find>
 InPlace<Find> inPlace(Find find)
 {
@@ -88,8 +88,7 @@ private:
 };
 
 // Returns a stride whose multiples, modulo `count`, are all numbers below `count`. Consecutive multiples are spread
-// evenly over the image. Neighbours in an image cost alike, so a rank that gets some consecutive ones gets a fair
-// share.
+// evenly over the image. Neighbouring tiles cost alike, so a rank that gets consecutive multiples gets a fair share.
 inline std::int64_t scatteringStride(std::int64_t count)
 {
     auto stride = static_cast<std::int64_t>(0.6180339887498949 * static_cast<double>(count)); // the golden section
@@ -100,8 +99,8 @@ inline std::int64_t scatteringStride(std::int64_t count)
 
 } // namespace detail
 
-// Which rank renders which tile (section 4.1.1 of the paper). All but Owned deal out pairs of tile and pass, so a tile
-// that needs many samples is rendered by many ranks; the image does not depend on which rank renders a tile.
+// Which rank renders which tile (section 4.1.1 of the paper). All but Owned deal out pairs of tile and pass, so many
+// ranks render a tile that needs many samples. The image does not depend on which rank renders a tile.
 enum class WorkDistribution : std::uint8_t {
     Owned,      // a rank renders the tiles that it owns: no input travels
     Linear,     // equal contiguous shares in the order of tiles
@@ -173,7 +172,7 @@ public:
 
     // Begins a frame, renders this rank's share, and returns the frame: call end(). All ranks must call it.
     // renderTile(tile) writes the pixels of tile.region into the tile, which Frame::start() has cleared. Several
-    // threads call it at once, for each pass with its own tile.pass and tile.sample. Waits for other ranks only for
+    // threads call it at once, once for each pass: tile.pass and tile.sample tell which. Waits for other ranks only for
     // room, as setTile(), and with WorkDistribution::Dynamic for jobs. Throws what FrameBuffer::begin() throws. An
     // exception of renderTile comes out of Frame::end() on all ranks, as a FrameError.
     template <class RenderTile>
@@ -219,7 +218,7 @@ class FromWorld {
 public:
     // Sets config.order and config.owners. `isOrdered`: inputs come in an order that the loop was given, without depth.
     // Returns the camera's exception, or null. Pass it to begin(), which then makes the frame fail on all ranks. Call
-    // begin() in any case: other ranks may have sent inputs of this frame already.
+    // begin() even then: other ranks may have sent inputs of this frame already.
     template <class FrameBuffer, class Camera>
     std::exception_ptr set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
                            bool isOrdered = false)
@@ -337,11 +336,11 @@ public:
 
     // Begins a frame, renders all bricks of the world into the tiles that they may project to, and returns the frame:
     // call end(). All ranks must call it. renderBrick(brick, tile) writes colour and depth of the pixels of
-    // tile.region, as far as their rays are within brick.bounds; depth grows away from the camera. Frame::start() has
-    // cleared the tile. Several threads call renderBrick at once, for each pass with its own tile.pass. Unlike in
-    // Listing 3, each rank declares its inputs, so that owners need not know the bricks. Waits for other ranks only for
-    // room, as setTile(). Throws what FrameBuffer::begin() throws. An exception of renderBrick or the camera comes out
-    // of Frame::end() on all ranks, as a FrameError.
+    // tile.region, from the part of each ray that is within brick.bounds; depth grows away from the camera.
+    // Frame::start() has cleared the tile. Several threads call renderBrick at once, once for each pass (tile.pass).
+    // Unlike in Listing 3, each rank declares its inputs, so owners need not know the bricks. Waits for other ranks
+    // only for room, as setTile(). Throws what FrameBuffer::begin() throws. An exception of renderBrick or the camera
+    // comes out of Frame::end() on all ranks, as a FrameError.
     template <class Camera, class RenderBrick>
     typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick, FrameConfig params = {},
                                       const typename FrameBuffer::TileFrameData& tileData = {},

@@ -1,6 +1,6 @@
 // MixedParallelLoop (Listing 5 of the paper): several ranks may hold a brick, and in each tile one of them renders it.
-// With one rank per brick this is data-parallel rendering; with all bricks on all ranks, image-parallel rendering.
-// OrderedLoop: the same for bricks in a known order, without sorting.
+// If one rank holds each brick, this is data-parallel rendering; if all ranks hold all bricks, image-parallel
+// rendering. OrderedLoop does this for bricks in a known order, without sorting.
 //
 // A tile-brick owner picks the rank. It is any type with
 //   int operator()(const SharedBrick& brick, int tile, int pass);      returns the rank, one of brick.ranks
@@ -35,8 +35,8 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Deals the tiles of a brick in turn to the ranks that hold it (section 4.3 of the paper). The order of tiles is mixed
-// first. Otherwise, a rank would get whole columns of some images, and neighbouring tiles cost alike.
+// Deals the tiles of a brick in turn to the ranks that hold it (section 4.3 of the paper), in a mixed order. Otherwise
+// a rank would get whole columns of some images, whose tiles may all cost more than others. Any thread may call it.
 struct RoundRobinBricks {
     int operator()(const SharedBrick& brick, int tile, int /*pass*/) const
     {
@@ -45,9 +45,10 @@ struct RoundRobinBricks {
     }
 };
 
-// Deals the passes of tiles so that all ranks have equally much to do. It uses the cost of the same brick and tile in
-// the last frame; if that is not known, the mean cost of the brick, or of all bricks. Call update() after each frame.
-// The cost is the number that renderBrick returns, or else the time that it took, in ns.
+// Deals out the passes of bricks in tiles so that all ranks have equally much to do. It takes the cost of each brick
+// and tile from the last frame; if that is not known, the mean cost of the brick, or of all bricks. Call update() after
+// each frame. The cost is the number that renderBrick returns, or else the time that it took, in ns. One thread at a
+// time may call update() and plan().
 class MeasuredCostBricks {
 public:
     // Takes the costs of the frame of this report, and forgets all others. A cost that is not finite counts as not
@@ -96,8 +97,8 @@ public:
             job.rank = least(job);
             loadOf(job.rank) += job.cost;
         }
-        // Not every rank holds every brick. So jobs may have to move on, from rank to rank, away from one with too much
-        // load.
+        // Not every rank holds every brick, so a rank may still have too much load. Moves jobs from rank to rank, step
+        // by step.
         for (int sweep = 0, moved = 1; sweep < 32 && moved > 0; ++sweep) {
             moved = 0;
             for (Job& job : jobs) {
@@ -260,15 +261,14 @@ struct OrderedWork : MixedWork {
         return static_cast<int>(job.item) - firstPair[static_cast<std::size_t>(pairs[job.item].tile)];
     }
 
-    // Puts the jobs first that are in front in their tile, so that other ranks hear soon which inputs are hidden. Not
-    // for images in which nothing is hidden: their tiles would be complete later.
+    // Puts the jobs first that are in front in their tile, so that other ranks soon learn which inputs are hidden. If
+    // nothing is hidden, this would only complete tiles later.
     void renderFrontsFirst()
     {
         std::stable_partition(jobs.begin(), jobs.end(), [this](const Job& job) { return generationOf(job) == 0; });
     }
 
-    // Announces this rank's inputs that hid others in the last frame, which are likely to do so again, to the ranks
-    // behind them.
+    // Tells the ranks behind them of this rank's inputs that hid others in the last frame, as they probably will again.
     void announceHiders(const FrameBase& frame, const SharedWorld& world, int tileCount, OwnerRef owner)
     {
         if (hider.size() != static_cast<std::size_t>(tileCount)) {
@@ -305,7 +305,7 @@ struct OrderedWork : MixedWork {
         });
     }
 
-    // Waits until other ranks have said of some undecided jobs whether they hide them, and moves these to `jobs`.
+    // Waits until other ranks have said whether they hide some of the undecided jobs, and moves these to `jobs`.
     // Returns false if there are no more, or the frame has failed.
     bool takeDecided(const FrameBase& frame)
     {
@@ -328,7 +328,7 @@ struct OrderedWork : MixedWork {
     }
 
 private:
-    // Calls f(generation, rank) for each rank that renders something behind a job. `generation` is the first one behind
+    // Calls f(generation, rank) for each rank that renders something behind a job. `generation`: the first one behind
     // it.
     void forEachRankBehind(const SharedWorld& world, const Job& job, OwnerRef owner,
                            FunctionRef<void(int, int)> f) const
@@ -348,7 +348,7 @@ private:
     }
 };
 
-// Calls renderBrick, and takes note of the cost for an owner that plans.
+// Calls renderBrick, and notes the cost if the owner plans.
 template <class Owner, class RenderBrick, class Tile>
 void renderMeasured(const FrameBase& frame, const Brick& brick, const RenderBrick& renderBrick, Tile& tile)
 {
@@ -433,10 +433,10 @@ private:
     std::vector<TileInput> inputs_; // that this rank declares
 };
 
-// The mixed-parallel loop for OrderedBlend. The generation of an input is its place in the order, so owners sort
-// nothing and wait for no declarations. With one pass and an image of colour alone, an input behind an opaque one is
-// neither rendered nor sent if its rank hears of that in time. An input that was hidden in the last frame waits until
-// the tile that hid it has been rendered again, at most FrameBufferConfig::quiet. Use it only if one order of the
+// The mixed-parallel loop for OrderedBlend. The generation of an input is its place in the order of the tile's bricks,
+// so owners sort nothing and wait for no declarations. With one pass and an image of colour alone, an input behind an
+// opaque one is neither rendered nor sent if its rank learns of that in time. If an input hid others in the last frame,
+// these wait until it has been rendered again, at most FrameBufferConfig::quiet. Use the loop only if one order of the
 // bricks is right for all rays of a frame: not with an extended lens or several eyes. Framebuffer, world and owner must
 // outlive it. One thread at a time may use it.
 template <class FrameBuffer, class TileBrickOwner>
@@ -449,8 +449,8 @@ public:
     }
 
     // As MixedParallelLoop::start(), but also waits for ranks that may hide inputs. `order`: the bricks front to back,
-    // by their place in world.bricks(), as visibilityOrder() returns them; each once, or the frame fails
-    // (InvalidArgument).
+    // by their place in world.bricks(), as visibilityOrder() returns them. If it does not have each once, the frame
+    // fails (InvalidArgument).
     template <class Camera, class RenderBrick>
     typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
                                       const RenderBrick& renderBrick, FrameConfig params = {},

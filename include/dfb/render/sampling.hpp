@@ -14,9 +14,9 @@
 
 DFB_NAMESPACE_BEGIN
 
-// For FrameConfig::samples: only the tiles that meet `region` (pixels of the image) are rendered, with `passes` samples
-// a pixel; the image keeps the others. All ranks must give the same arguments. Any thread. Waits for nothing. Throws
-// InvalidArgument for less than 1 pass.
+// For FrameConfig::samples: a plan by which only the tiles that meet `region` (pixels of the image) are rendered, with
+// `passes` samples a pixel. The image keeps the other tiles. All ranks must give the same arguments. Any thread. Waits
+// for nothing. Throws InvalidArgument for less than 1 pass.
 inline SamplePlan samplesIn(const TileLayout& layout, const Region& region, int passes = 1)
 {
     if (passes < 1)
@@ -36,8 +36,8 @@ struct SamplingConfig {
     int frameSamples = 64; // the most that a tile gets in one frame; memory grows with it
 };
 
-// Use it in the same way on all ranks. Its decisions depend only on the frames' reports, which are the same everywhere.
-// If a rank decides otherwise, the frame fails (Disagreement). The tile operation must be a Progressive one:
+// Make the same calls on all ranks. The decisions depend only on the frames' reports, which are equal on all ranks. If
+// a rank decides otherwise, the frame fails (Disagreement). The tile operation must be a Progressive one:
 //
 //   dfb::ImageParallelLoop loop(fb);
 //   dfb::AdaptiveSampler sampler(fb.layout(), {0.01});
@@ -97,7 +97,7 @@ public:
         decide();
     }
 
-    // samplesTaken(): the samples of all pixels so far. samplesSaved(): how many more there would be if each tile had
+    // samplesTaken(): the samples of all pixels so far. samplesSaved(): how many fewer these are than if each tile had
     // as many as the tile with the most.
     std::int64_t samplesTaken() const
     {
@@ -122,8 +122,8 @@ private:
         plan_.resize(taken_.size());
         for (std::size_t t = 0; t < taken_.size(); ++t)
             plan_[t] = {taken_[t], std::min(wanted(t), config_.maxSamples) - taken_[t]};
-        // Few samples may have missed something small. A tile therefore gets at least a quarter of its neighbour's
-        // samples, so that an edge that only just reaches into it is not lost.
+        // Few samples may miss something small, such as an edge that only just reaches into the tile. So a tile gets at
+        // least a quarter of its neighbours' samples.
         for (int row = 0; row < layout_.tilesY(); ++row)
             for (int column = 0; column < layout_.tilesX(); ++column) {
                 const auto tile = static_cast<std::size_t>(layout_.tileAt(column, row));
@@ -136,8 +136,8 @@ private:
             }
     }
 
-    // How many samples the tile needs in all, as far as can be told: the error falls with the root of their number. At
-    // most twice the number it has, since an error from few samples is itself uncertain.
+    // An estimate of how many samples the tile needs in all: the error falls with the root of their number. At most
+    // twice the number it has, as an error from few samples is itself uncertain.
     int wanted(std::size_t t) const
     {
         if (taken_[t] < config_.firstSamples)

@@ -1,5 +1,4 @@
-// SharedWorld: the bricks of all ranks, and which ranks hold each. Used for bricks that several ranks hold, and to find
-// an order of the bricks from front to back.
+// SharedWorld: the bricks of all ranks, and which ranks hold each. visibilityOrder(): the bricks from front to back.
 #pragma once
 
 #include <dfb/base/detect.hpp>
@@ -22,8 +21,8 @@ struct SharedBrick : Brick {
     std::vector<int> ranks;
 };
 
-// The bricks of all ranks, and which ranks hold them; equal on all ranks. Takes memory and time in proportion to the
-// number of all bricks.
+// The bricks of all ranks, and which ranks hold them; equal on all ranks. Memory and time grow with the number of all
+// bricks. Any thread may read it.
 class SharedWorld {
 public:
     // Gathers the bricks of all ranks of a framebuffer or an ImageCompositor. Bricks with the same id are the same
@@ -148,7 +147,7 @@ DFB_COMPILED_ONCE const char* FrontToBack::findAgain()
 }
 
 // If the eye is on one side of a plane between two boxes, or on the plane, the box on that side may come first. If no
-// ray crosses the plane, either may: the eye's coordinate is NaN then, and all comparisons are false.
+// ray crosses the plane, either box may: the eye's coordinate is then NaN, and all comparisons are false.
 DFB_COMPILED_ONCE bool FrontToBack::mayPrecede(const Box3& a, const Box3& b) const
 {
     const auto along = [](float aLower, float aUpper, float bLower, float bUpper, float e) {
@@ -173,8 +172,8 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& ey
     return bricks.order();
 }
 
-// Returns this order for all rays of a camera that has commonEye(), which may be orthographic. Throws as above, and
-// also if commonEye() returns nothing.
+// Returns this order for a camera that has commonEye(), such as an orthographic one. Also throws InvalidArgument if
+// commonEye() returns nothing.
 template <class Camera, std::enable_if_t<detail::has_common_eye_v<Camera>, int> = 0>
 std::vector<int> visibilityOrder(const SharedWorld& world, const Camera& camera)
 {

@@ -1,15 +1,14 @@
-// Visibility: which tiles a brick may project to; and a perspective camera that can tell.
+// Visibility: which tiles a brick may project to; and PerspectiveCamera.
 //
 // A camera, for the loops in render/, is any type with
 //   Region project(const Box3& bounds, int width, int height) const;
 // It returns the pixels of a width x height image that the box may cover, for any sample position within a pixel. It
-// must not leave out a pixel; a tile too many only costs a header of 64 bytes. In place of a Region it may return a
-// Footprint, a convex polygon that leaves out tiles in the corners of the rectangle, or a std::vector of either: a
-// stereo camera returns two. A camera may also have
+// must not leave out a pixel; a tile too many costs only a header of 64 bytes. It may also return a Footprint, a convex
+// polygon, which leaves out tiles in the corners of a Region; or a std::vector of either, as a stereo camera does. A
+// camera may also have
 //   std::optional<Vec3> commonEye() const;
-// the point where all its rays begin, if there is one: then AlphaBlend need not sort (FrameConfig::order). For
-// parallel rays it is infinitely far away, where they come from: each coordinate is +-infinity, or NaN if the rays are
-// perpendicular to that axis.
+// the point where all its rays begin, if there is one: then AlphaBlend need not sort (FrameConfig::order). Parallel
+// rays come from a point at infinity: each coordinate is +-infinity, or NaN if the rays are perpendicular to that axis.
 // Loops call both on the thread that is in start(); if they throw, the frame fails on all ranks.
 #pragma once
 
@@ -34,7 +33,7 @@ struct PixelPoint {
     double x = 0, y = 0;
 };
 
-// A convex polygon of an image: what a convex body may cover.
+// A convex polygon in an image: the part that a convex body may cover. Any thread may call const members.
 class Footprint {
 public:
     Footprint() = default; // nothing
@@ -194,8 +193,8 @@ struct SeenCorner {
 // reaches behind the eye, and nothing if all of the box is behind it.
 //
 // The image of a convex body in front of the eye is the hull of the images of its corners. The margin covers the
-// rounding of renderers' rays and points, which are floats: 1/8 pixel for directions (2^-23 of an image of 65536 pixels
-// is less than 1/100) and for points some units of the last place of the coordinates.
+// rounding of renderers' rays and points, which are floats. It is 1/8 pixel for directions (2^-23 of an image of 65536
+// pixels is less than 1/100), and some units of the last place of the coordinates for points.
 template <class See>
 Footprint footprintOf(const Box3& bounds, int width, int height, const See& see)
 {
@@ -228,9 +227,9 @@ Footprint footprintOf(const Box3& bounds, int width, int height, const See& see)
 
 // The footprint of a box for a pinhole whose image has its middle at width / 2 + shiftX, or for a lens.
 //
-// Seen from a point of the lens at most `lensRadius` off its middle, a point at depth z is off by at most lensRadius
-// |1/z - 1/focusDistance| in the plane at distance 1, so each corner's image lies in a square around its image from the
-// middle. The hull of all these squares holds the image of the box from every point of the lens.
+// Take a point of the lens at most `lensRadius` off its middle. Seen from there, a point at depth z is off by at most
+// lensRadius |1/z - 1/focusDistance| in the plane at distance 1. So each corner's image lies in a square around its
+// image from the middle. The hull of all these squares holds the image of the box from every point of the lens.
 DFB_COMPILED_ONCE Footprint projectBox(const Box3& bounds, const Pose& pose, int width, int height, double shiftX = 0,
                                        double lensRadius = 0, double focusDistance = 1);
 
@@ -266,7 +265,7 @@ struct LensSample {
     double lensU = 0, lensV = 0, time = 0;
 };
 
-// A pinhole at `eye`. Pixels are square; pixel coordinates grow to the right and down.
+// A pinhole at `eye`. Pixels are square; pixel coordinates grow to the right and down. Any thread may call any member.
 class PerspectiveCamera {
 public:
     // Looks from `eye` to `target`; `fovY` is the vertical angle of view in degrees. Throws InvalidArgument if the two
@@ -276,8 +275,8 @@ public:
     {
     }
 
-    // Looks along `view`, of any length. This also works where the eye is so far from the origin that no float target
-    // near it is exact. Throws as above.
+    // Looks along `view`, of any length. Use it if the eye is so far from the origin that a float target near it would
+    // not be exact. Throws as above.
     static PerspectiveCamera along(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY)
     {
         return PerspectiveCamera(detail::poseOf(eye, view, up, fovY));
@@ -301,7 +300,7 @@ public:
         return {eye(), direction(x, y, width, height)};
     }
 
-    // Returns what the box may cover: the whole image if it reaches behind the eye, nothing if all of it is behind.
+    // Returns the pixels that the box may cover: all if it reaches behind the eye, none if all of it is behind.
     Footprint project(const Box3& bounds, int width, int height) const
     {
         return detail::projectBox(bounds, pose_, width, height);
@@ -391,8 +390,8 @@ std::vector<BrickInTile> visibleTiles(const AnyWorld& world, const Camera& camer
     return memory;
 }
 
-// Returns the inputs that a rank declares if it renders these pairs, which must be of this world: nobody checks it. The
-// source is the brick's id. Any thread. Waits for nothing. Uses the memory of `memory` for the result.
+// Returns the inputs that a rank declares if it renders these pairs. They must be of this world, which is not checked.
+// The source is the brick's id. Any thread. Waits for nothing. Uses the memory of `memory` for the result.
 inline std::vector<TileInput> inputsOf(const World& world, const std::vector<BrickInTile>& pairs,
                                        std::vector<TileInput> memory = {})
 {

@@ -71,14 +71,14 @@ inline bool isBox(const Box3& b) noexcept
 } // namespace detail
 
 // A region of space, with the data in it. It is convex and overlaps no other brick, except in a DeepParallelLoop.
-// Camera rays see it within `bounds` only: renderers clip them to it. Its data may reach farther: ghost voxels, or
-// geometry for shadows and ambient occlusion, which secondary rays see beyond the bounds as well.
+// Renderers clip camera rays to `bounds`. Its data may reach farther: ghost voxels, or geometry for shadows and ambient
+// occlusion, which secondary rays see beyond the bounds, too.
 struct Brick {
     std::uint32_t id = 0; // equal on two ranks: the same brick, whose bounds must be equal in a SharedWorld
     Box3 bounds;
 };
 
-// The bricks of this rank; there may be none. While bricks are added, no other thread may use it.
+// The bricks of this rank; there may be none. Any thread may read it, but not while bricks are added.
 class World {
 public:
     World() = default;
