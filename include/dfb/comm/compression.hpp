@@ -15,7 +15,7 @@
 DFB_NAMESPACE_BEGIN
 
 // A lossless compressor for message payloads. A payload that does not get smaller travels as it is. Stateless: all
-// members are called from several threads at once.
+// members are called from several threads at once. An exception makes the frame fail on all ranks.
 class Codec {
 public:
     virtual ~Codec() = default;
@@ -34,20 +34,20 @@ public:
 // When messages are compressed, if there is a codec.
 enum class CompressionMode : std::uint8_t {
     Always, // every message with pixels for another rank, also within a node
-    // Between nodes, in frames where compressing has turned out to be faster. All ranks try a few frames with it and a
-    // few without, take the better, and try the other again now and then. Each rank leaves out the ranks for which its
-    // messages do not become smaller.
+    // Only between nodes, and only if frames are faster with it. All ranks measure a few frames with and a few without,
+    // take the faster way, and now and then try the other again. Each rank leaves out the ranks for which its messages
+    // do not become smaller.
     Auto
 };
 
 namespace detail {
 
-// CompressionTrial: finds out by trying whether a framebuffer's messages are worth compressing, because no formula
-// knows how a network, a codec and the cores work together.
+// CompressionTrial: measures whether compression makes frames faster. No formula could tell: it depends on the network,
+// the codec and the cores.
 //
-// Ranks that are told the same times choose the same. To begin with, frames with and without compression take turns.
-// Then the better kind is used. The other is tried again now and then, more and more seldom, and when frames have
-// become much slower or faster. If it seems better by a tenth, both take turns again.
+// Ranks that get the same times make the same choice. At first, frames with and without compression take turns. Then
+// the faster way is used. The other is tried again more and more seldom, and when frames have become much slower or
+// faster. If it seems faster by a tenth, both take turns again.
 class CompressionTrial {
 public:
     // Whether the next frame is to be compressed.
@@ -135,7 +135,7 @@ private:
 };
 
 // Compression: which messages of a rank are compressed in a frame. The pixels for one rank can be noise, those for
-// another all alike. A rank for which nearly nothing was gained is left alone for some frames and then tried again,
+// another all equal. A receiver whose messages hardly get smaller is left out for some frames, and then tried again,
 // more and more seldom. sent() and codecFor() may be called from any thread, endFrame() between frames.
 class Compression {
 public:

@@ -1,5 +1,5 @@
-// Connection: carries the messages of any number of framebuffers over one communicator. It finds the object that a
-// message is for, checks that each message comes once and whole, and moves messages (section 3.2 of the paper).
+// Connection: carries the messages of any number of framebuffers over one communicator (section 3.2 of the paper). It
+// passes each message to the object that it is for, and checks that it comes once and whole.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
@@ -43,12 +43,13 @@ struct NetworkConfig {
     // A rank counts as lost if no message has come from it for this long while messages are expected. It may have
     // ended, hang, or be out of reach. Needs a progress thread on both ranks. 0: this rank watches no other, and no
     // other watches it. Otherwise 100 ms to 24 days; framebuffers refuse other values. Below 400 ms it must be the same
-    // on all ranks. It is also the time-out of a reduction after a message that could not be read; for this 0 means no
-    // limit, unless the frame has a time-out.
+    // on all ranks. After a message that could not be read, reductions have this time-out, too; here 0 means no limit,
+    // unless the frame has a time-out.
     std::chrono::milliseconds peerTimeout = defaultPeerTimeout;
-    // Called once when a rank is lost, on one or several of the others, by a thread of the library or the one that
-    // destroys the connection. It must be quick and not throw. All ranks then get a TransportError with the lost rank
-    // in ErrorInfo::rank. Null: the error is printed, and MPI_Abort ends the job, as MPI does not go on without a rank.
+    // Called once when a rank is lost, on those of the others that notice it, by a thread of the library or the one
+    // that destroys the connection. It must be quick and not throw. All ranks then get a TransportError with the lost
+    // rank in ErrorInfo::rank. Null: the error is printed, and MPI_Abort ends the job, as MPI cannot go on without a
+    // rank.
     std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 
@@ -102,8 +103,8 @@ private:
 
 } // namespace detail
 
-// Framebuffers on one connection share its progress thread and its buffers. They must be made in the same order on all
-// ranks, and destroyed before it. Any thread may call any member, unless it says otherwise.
+// The progress thread and the memory pool that framebuffers and walls share. These must be made in the same order on
+// all ranks, and destroyed before it. Any thread may call any member, unless it says otherwise.
 class Connection final : private TransportHandler {
 public:
     // See connect(). `pool`: the pool that `link` was made with.
@@ -125,8 +126,8 @@ public:
         }
     }
 
-    // Waits for the other ranks. But if an exception is passing that the other ranks do not get, they may never come
-    // here; then it tells them and leaves.
+    // Collective. Waits for the other ranks. But if an exception is passing on this rank alone, it tells the others,
+    // and does not wait: they may never come here.
     ~Connection()
     {
         if (std::uncaught_exceptions() > exceptions_ && thrownByAll_.expired())
@@ -140,9 +141,9 @@ public:
     const NetworkConfig& config() const noexcept { return config_; }
     const std::shared_ptr<MemoryPool>& pool() const noexcept { return pool_; }
 
-    // How many threads this rank should use: the processors that the calling thread may run on, divided by the number
-    // of this connection's ranks on this node that may run there, too; at least 1. A framebuffer that is given no
-    // executor makes this many threads.
+    // How many threads this rank should use: P / R, at least 1. P is the number of processors that the calling thread
+    // may run on, and R the number of ranks on this node that may run there, with this one. A framebuffer that is given
+    // no executor makes this many threads. Waits for nothing.
     int threadShare() const noexcept
     {
         return dfb::threadShare(Processors::ofThisThread().count(), link_->sharingRanks());
@@ -157,8 +158,7 @@ public:
 
     // ---- for the objects that it serves
 
-    // Gives the receiver an address, which is the same on all ranks, and then the messages that have already come for
-    // it.
+    // Gives the receiver an address, equal on all ranks, and then the messages that have already come for it.
     void attach(detail::MessageReceiver& receiver, std::uint32_t& address)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -211,8 +211,8 @@ public:
     // Whether this rank and the other one see memory of each other.
     bool sharesMemoryWith(int other) const { return isSeenBy(other) && blockAt(other, 2, 0); }
 
-    // The lowest rank on this rank's node, which is this rank and those that share memory with it. 0 with a transport
-    // that does not know of shared memory: then all ranks are taken to be on one node.
+    // The lowest rank on this rank's node: of this rank and those that share memory with it. 0 if the transport knows
+    // no shared memory: all ranks then count as being on one node.
     int firstOnNode() const
     {
         int first = 0;
@@ -240,14 +240,15 @@ public:
         return block ? block + before : nullptr;
     }
 
-    // Notes that all ranks have the same configuration, `checksums` included. Before that, messages of the set-up may
-    // come with or without a checksum, so that ranks can say what differs. May be called any number of times.
+    // Notes that all ranks have the same configuration, `checksums` included. Until then, messages of the set-up may
+    // come with or without a checksum, so that ranks can tell each other what differs. May be called any number of
+    // times.
     void setAlike() noexcept { isAlike_ = true; }
 
     // How many messages came twice and were dropped, since the last call.
     std::int64_t takeDuplicates() noexcept { return duplicates_.exchange(0); }
 
-    // A text that says which ranks have sent messages that did not arrive although later ones did. May be empty.
+    // Names the ranks that have sent messages which did not arrive although later ones did. May be empty.
     std::string lost() const
     {
         const std::lock_guard<std::mutex> lock(peersMutex_);
@@ -262,8 +263,8 @@ public:
     // Says that messages may come from now on (true), or no more (false). Each true is followed by one false.
     void expectMessages(bool expect) { progress_.expectMessages(expect); }
 
-    // For an exception that all ranks throw now: returns an object that the exception must keep. While that exists, the
-    // connection ends in order although an exception is passing.
+    // For an exception that all ranks throw now: returns an object that the exception must keep. While the object
+    // exists, the connection ends in order although an exception is passing.
     std::shared_ptr<const void> throwByAll()
     {
         auto whileThrown = std::make_shared<char>();
@@ -288,8 +289,8 @@ public:
     using Expecting = Telling<&ProgressThread::expectMessages>;
     // The connection looks for messages often.
     using Hurry = Telling<&ProgressThread::hurry>;
-    // The calling thread moves messages in place of the progress thread, because it stays in calls that do so.
-    // Otherwise the two threads, if they share a processor, would take turns for each message.
+    // The calling thread, which stays in calls that move messages, replaces the progress thread. Otherwise the two
+    // threads, if they share a processor, would take turns for each message.
     using StandIn = Telling<&ProgressThread::standIn>;
 
     // For a thread that waits: moves messages in place of the progress thread, if there is one. Returns whether any
@@ -335,8 +336,8 @@ public:
         return true;
     }
 
-    // Runs a step in which an object is made that exists on all ranks. If the step throws, the connection fails, as the
-    // other ranks would wait for this one. Throws what the step throws.
+    // Runs a step that makes an object of all ranks. If it throws, the connection fails, because the other ranks would
+    // wait for this one. Throws what the step throws.
     void giveUpIfThrows(detail::FunctionRef<void()> step)
     {
         try {
@@ -391,7 +392,7 @@ private:
         return crc == 0 ? 1 : crc;
     }
 
-    // Whether ranks find out by messages of this kind whether they were set up alike, or that they cannot go on.
+    // Whether messages of this kind tell ranks that their configurations differ, or that a rank cannot go on.
     static bool isOfSetUp(detail::MessageKind kind)
     {
         using Kind = detail::MessageKind;
@@ -454,7 +455,7 @@ private:
                             [&](const Receiver& r) { return r.first == address; });
     }
 
-    // Objects are made in the same order on all ranks, so a sender cannot have many more of them than this rank.
+    // Objects are made in the same order on all ranks, so a sender has few more of them than this rank.
     void checkReceiver(std::uint32_t address)
     {
         constexpr std::uint32_t mostAhead = 1024;
@@ -504,7 +505,7 @@ private:
         return isOn ? config_.peerTimeout : std::chrono::milliseconds(0);
     }
 
-    // Short enough to answer a Ping in time, also to a rank with a shorter time-out, down to 400 ms.
+    // Short enough to answer a Ping in time, even that of a rank with a shorter time-out, down to 400 ms.
     Clock::duration longestNap() const
     {
         const Clock::duration longest = std::chrono::milliseconds(250);

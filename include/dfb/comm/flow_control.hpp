@@ -1,12 +1,12 @@
-// FlowControl: limits how much a rank may send to another one before the receiver has room again. The limit is credit
-// in bytes, from one pool per receiver.
+// FlowControl: limits how many bytes a rank may send to another one before the receiver has room again. The limit is
+// called credit, and comes from one pool per receiver.
 //
 // Half of a pool is divided among the senders, who use their parts without asking. A sender that needs more asks for it
-// (CreditRequest) and gets it from the other half, in the order of asking and always for whole messages, so that credit
-// that is granted is used and comes back. A credit returns when the receiver has taken the message out of its inbox.
-// Thus the messages on the way to a rank and in its inbox never exceed its pool, however many senders there are. Counts
-// are running totals within an epoch (a frame): a Credit that overtakes another does no harm, and what got lost has no
-// effect beyond its epoch.
+// (CreditRequest) and gets it from the other half. Credit is granted in the order of asking, and for whole messages: so
+// all of it is used and comes back. A credit returns when the receiver has taken the message out of its inbox. Thus the
+// messages on the way to a rank and in its inbox never exceed its pool, however many senders there are. Counts are
+// running totals within an epoch (a frame): a Credit may overtake another, and a lost one has no effect after its
+// epoch.
 #pragma once
 
 #include <dfb/base/fifo.hpp>
@@ -68,9 +68,9 @@ public:
         matters_ = nullptr;
     }
 
-    // From now on only those messages of this epoch count for which `matters(message)` is true. Drops others that wait,
-    // and those that are given to send() later. `keepsAsked`: messages for which credit was asked are kept, because the
-    // receiver sets aside room for them that other senders need.
+    // From now on only those messages of this epoch are sent for which `matters(message)` is true. Drops the others,
+    // those that wait and those that are given to send() later. `keepsAsked`: keeps messages for which credit was
+    // asked, because the receiver has set aside room for them that other senders need.
     void drop(std::function<bool(const Buffer&)> matters, bool keepsAsked)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -197,8 +197,8 @@ public:
         in.consumed += byteCount;
         free_ -= extraOf(in, in.granted);
         inboxBytes_ -= byteCount;
-        // A Credit is not sent for every message. But the bytes that a sender has not been told of must stay below its
-        // part of the pool, as it may be waiting for them.
+        // Not every message is answered by a Credit. But the bytes that the sender has not been told of must stay below
+        // its part of the pool, as it may wait for them.
         if (in.consumed - in.told >= allowance_ / 2)
             grant(source, in, in.consumed + allowance_);
         serve(lock);

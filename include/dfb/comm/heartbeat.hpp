@@ -1,7 +1,7 @@
 // Heartbeat: decides which ranks this one listens for, when to ask them for a sign of life, and which of them is lost.
 // The connection sends and receives the messages for it.
 //
-// It is needed because MPI tells nobody that a rank has ended or hangs: a receive from it just never completes.
+// It is needed because MPI does not report that a rank has ended or hangs: a receive from it never completes.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -14,8 +14,8 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Some minutes, as a rank may be held up for a while and then go on: by a batch system, by swapping, in a debugger. How
-// long it renders does not matter, since its progress thread answers meanwhile.
+// Some minutes, as a batch system, swapping or a debugger may hold up a rank for a while. How long it renders does not
+// matter, since its progress thread answers meanwhile.
 inline constexpr std::chrono::milliseconds defaultPeerTimeout{300000};
 
 namespace detail {
@@ -29,9 +29,8 @@ public:
     using Duration = Time::duration;
 
     // `neighbours`: the ranks that this one listens for, as they do for it. They are its neighbours in the tree of
-    // reductions, whose messages it gets in each frame anyway. Each of several ranks has at least one neighbour, and
-    // none has more than log2 of their number, rounded up. Whichever ranks are lost, one of them has a neighbour that
-    // is not. `timeout` 0: this rank listens for nobody.
+    // reductions, whose messages it gets in each frame anyway. Of P > 1 ranks each has 1 to log2(P) neighbours, rounded
+    // up. Whichever ranks are lost, one of them has a neighbour that is not. `timeout` 0: this rank listens for none.
     Heartbeat(const std::vector<int>& neighbours, std::chrono::milliseconds timeout) : timeout_(timeout)
     {
         for (const int rank : neighbours)
@@ -63,9 +62,9 @@ public:
         int lost = -1; // nothing has been heard of this rank for the whole time-out
     };
 
-    // Returns whom to ask, and which rank is lost. This rank must have polled since the last call. Time counts only
-    // while this rank is `expecting` messages. It does not count if the last call was long ago: this rank was then held
-    // up itself, and messages of the others may still wait to be received.
+    // Returns the ranks to ask, and the one that is lost. This rank must have polled since the last call. Time counts
+    // only while this rank is `expecting` messages. It does not count if the last call was long ago: this rank was then
+    // held up itself, and messages of the others may still wait.
     Due due(Time now, bool expecting)
     {
         const bool wasHere = isExpecting_ && now - last_ <= patience();

@@ -1,5 +1,5 @@
-// InprocTransport: ranks are threads of one process; no launcher and no MPI. A message is handed to its receiver
-// by the sending thread.
+// InprocTransport: ranks are threads of one process, without launcher and MPI. The sending thread hands a message to
+// its receiver.
 #pragma once
 
 #include <dfb/comm/connection.hpp>
@@ -136,7 +136,7 @@ public:
         Endpoint& peer = endpoint(destination);
         std::lock_guard<std::mutex> lock(peer.mutex);
         if (peer.stopped)
-            return; // it has its verdict and has left, and needs no more messages
+            return; // it has left, and needs no more messages
         if (peer.handler)
             peer.handler->receive(rank_, std::move(message));
         else

@@ -34,12 +34,12 @@ namespace detail {
 // The object that the messages are for.
 class MailboxOwner {
 public:
-    // Takes a message. Called in tasks, for several messages at once and in any order. Messages of reductions come
-    // here, too, and the owner passes them on to receiveReduction(). Those of reduce() do not come here. If it throws
-    // Error or std::bad_alloc, the connection fails.
+    // Takes a message. Called in tasks, for several messages at once and in any order. Messages of the owner's own
+    // reductions come here, too, to be passed on to receiveReduction(); those of reduce() do not. If it throws Error or
+    // std::bad_alloc, the connection fails.
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
-    // A message of rank error.from could not be read. Nobody knows its kind, or which object it was for. If no frame
-    // can fail because of it, the owner calls keepDamage().
+    // A message of rank error.from could not be read. Its kind and its receiver are not known. If no frame can fail
+    // because of it, the owner calls keepDamage().
     virtual void undecodable(const ErrorInfo& error) = 0;
     virtual void work(int) {} // runs the work of submitWork(number), in a task
     virtual void polled() {}  // called by wait() after it has moved messages itself
@@ -84,7 +84,7 @@ public:
     ~Mailbox() { stop(); }
 
     // Ends the calls of the handler, and waits for those under way. Tells the neighbours in the tree of reductions that
-    // this rank takes part in nothing that begins from now on.
+    // this rank takes no part in what begins later.
     void stop()
     {
         if (!isEnding_ && !failed())
@@ -122,7 +122,7 @@ public:
         enterEpoch(number);
     }
     // Begins an epoch without counting credit anew. Gives up if a neighbour in the tree of reductions has left before
-    // it.
+    // that.
     void enterEpoch(std::int64_t number)
     {
         epoch_ = number;
@@ -175,10 +175,9 @@ public:
         return kind == MessageKind::Fragment || kind == MessageKind::FinishedTiles;
     }
 
-    // Waits until over(), or until the messages that this rank has sent and no receiver has taken out of its inbox have
-    // at most poolBytes in all. Runs waiting tasks meanwhile, so that ranks that wait for each other get on. Does not
-    // wait on a thread that cannot make progress. Returns false if nothing is taken for as long as `limit`, unless that
-    // is 0.
+    // Waits until over(), or until the messages that receivers have not taken out of their inboxes have at most
+    // poolBytes in all. Runs waiting tasks meanwhile, so that ranks that wait for each other go on. Does not wait on a
+    // thread that cannot move messages. Returns false if no message is taken for as long as `limit`; 0: no limit.
     bool waitForRoom(FunctionRef<bool()> over, std::chrono::milliseconds limit)
     {
         std::size_t before = flow_.underWay();
@@ -210,7 +209,7 @@ public:
         return true;
     }
 
-    // Throws InvalidArgument if the calling thread would have to move messages while it waits, but may not. Calls that
+    // Throws InvalidArgument if the calling thread must move messages while it waits, but may not call MPI. Calls that
     // wait begin with this check.
     void requireProgress() const
     {
@@ -340,9 +339,9 @@ public:
         const Connection::Hurry hurry(*connection_);
         std::unique_lock<std::mutex> lock(mutex_);
         if (!connection_->needsCaller()) {
-            // There may be too few workers: those of several ranks in one process can all be in waitForRoom(), waiting
-            // for each other. So this thread looks for tasks now and then. It looks less often while there are none,
-            // because with many ranks in a process looking would take all the time.
+            // All workers may be in waitForRoom(): those of several ranks in one process can wait for each other. So
+            // this thread looks for tasks now and then. While there are none it looks less and less often, because with
+            // many ranks in a process looking would take all the time.
             constexpr std::chrono::milliseconds shortest{2}, longest{32};
             for (std::chrono::milliseconds pause = shortest; !over() && !late();) {
                 const auto next = Clock::now() + pause;
@@ -355,9 +354,8 @@ public:
                 lock.lock();
             }
         } else {
-            // This thread stays awake at first, because a nap takes about 0.1 ms, and a frame waits for some five
-            // messages one after the other. But a rank that is awake takes time from the ranks that share its
-            // processor.
+            // This thread stays awake at first: a nap takes about 0.1 ms, and a frame waits for some five messages one
+            // after the other. But a rank that is awake takes time from the ranks that share its processor.
             SpinWait spin(std::chrono::microseconds(connection_->isOversubscribed() ? 30 : 1000));
             // Messages that were just queued, such as results for ranks below in the tree, must leave even if the wait
             // is over. They get a second for it if the deadline comes sooner.
@@ -389,9 +387,9 @@ public:
     }
 
     // Combines `own` over all ranks, and returns the result. Collective. Waits for all ranks. Throws InvalidArgument as
-    // requireProgress() does, and TransportError. If a message could not be read, it may have been a part of this
-    // reduction. Then reduce() throws TransportError, too, if there is no result within a second, or within peerTimeout
-    // if the message came before this call; see waitForResult().
+    // requireProgress() does, and TransportError. A message that could not be read may have been a part of this
+    // reduction. Then reduce() throws TransportError, too, if there is no result within a second; or within
+    // peerTimeout, if the message came before this call. See waitForResult().
     Bytes reduce(Bytes own, ReductionTable::Combine combine)
     {
         requireProgress();
@@ -474,13 +472,13 @@ public:
         return result;
     }
 
-    // Calls make(), which makes or sends this rank's part of what others wait for. If it lacks memory, the connection
-    // fails on all ranks, and this throws std::bad_alloc.
+    // Calls make(), which makes or sends a part that other ranks wait for. If it lacks memory, the connection fails on
+    // all ranks, and this throws std::bad_alloc.
     void makePart(FunctionRef<void()> make) { connection_->giveUpWithoutMemory(make); }
 
 private:
-    // Begins the part that this rank brings to a call, with its rank and the call's name. In a combined part the lowest
-    // of the ranks stands there; or -1 and a text, if the ranks have made different calls.
+    // Begins this rank's part of a call, with the rank and the call's name. A combined part has the lowest rank; or -1
+    // and a text, if the ranks have made different calls.
     Bytes partOf(const std::string& call) const
     {
         Bytes out;
@@ -489,9 +487,9 @@ private:
         return out;
     }
 
-    // Reduces the parts that ranks bring to a call. `combine(a, b, out)` combines what follows the call's name in two
-    // parts; `read` gets what follows it in the combined part of all ranks. Throws InvalidArgument if the ranks have
-    // made different calls.
+    // Reduces the ranks' parts of a call. `combine(a, b, out)` combines the bytes after the call's name in two parts;
+    // `read` gets these bytes in the combined part of all ranks. Throws InvalidArgument if the ranks have made
+    // different calls.
     void reduceParts(Bytes&& mine, std::function<void(ByteReader&, ByteReader&, Bytes&)> combine,
                      FunctionRef<void(ByteReader&)> read)
     {
@@ -577,8 +575,8 @@ private:
         Clock::time_point last_ = Clock::now();
     };
 
-    // For a moment a waiting thread runs tasks and moves messages itself, because threads that it would have to wake
-    // may have to wait for a core.
+    // For a moment a waiting thread runs tasks and moves messages itself: threads that it would wake may have to wait
+    // for a core.
     void waitAwake(FunctionRef<bool()> over)
     {
         if (!connection_->hasProgressThread() || connection_->needsCaller())
@@ -677,8 +675,7 @@ private:
         Leaving how;
     };
 
-    // Gives up if this rank has begun something in which a rank that has left does not take part, because it would
-    // never end.
+    // Gives up if this rank has begun something without a rank that has left: it would never end.
     void checkLeft()
     {
         std::vector<Left> all;
@@ -740,7 +737,7 @@ private:
                 handler_.incoming(a.source, a.header, std::move(a.message));
             }
         } catch (const Error& e) {
-            giveUp(a.source, e.info()); // whichever it was, some rank waits for it
+            giveUp(a.source, e.info()); // some rank waits for it
         } catch (const std::bad_alloc& e) {
             giveUp(a.source, errorInfo(ErrorKind::Transport, e.what()));
         }

@@ -1,6 +1,6 @@
-// Messages as bytes. Every message starts with a MessageHeader, by which it is recognised before it is used, and which
-// holds its checksum. The bodies of small control messages (manifests, verdicts): SmallBytes holds one, which is
-// written field by field, and ByteReader reads it. A reader never reads beyond the end of its bytes.
+// Messages as bytes. Every message starts with a MessageHeader, which is checked before the message is used, and has
+// its checksum. SmallBytes: the body of a small control message, such as a manifest or a verdict, written field by
+// field. ByteReader reads it, and never reads beyond its end.
 #pragma once
 
 #include <dfb/buffer.hpp>

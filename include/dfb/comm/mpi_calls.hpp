@@ -26,7 +26,7 @@ inline const char* mpiLevelName(int level)
 }
 
 // Throws TransportError unless the call was successful. `rank`: this rank. `peer`: the rank that the call was about, or
-// -1. It may be the cause: over a network MPI can find that a rank is gone before the library does.
+// -1. That rank may be the cause: MPI can find that a rank is gone before the library does.
 inline void checkMpi(int code, const char* call, int rank, int peer = -1)
 {
     if (code == MPI_SUCCESS)
@@ -51,14 +51,14 @@ inline bool mpiSays(int (*ask)(int*))
     return answer != 0;
 }
 
-// Throws TransportError if this code was compiled for Open MPI and another MPI is there when it runs, or the other way
-// round: they do not understand each other's communicators. MPICH and its relatives do.
+// Throws TransportError if this code was compiled for Open MPI but runs with another MPI, or the other way round: their
+// communicators differ. Those of MPICH and its relatives do not.
 inline void requireMpiOfHeaders()
 {
     char text[16384] = ""; // MPI_MAX_LIBRARY_VERSION_STRING of the other MPI may be larger than that of this one
     int length = 0;
     MPI_Get_library_version(text, &length);
-    // Only how it begins: a library that translates between MPIs names them after itself.
+    // Only the first word: a library that translates between MPIs also names those.
     const bool isOpenMpi = std::strncmp(text, "Open MPI", 8) == 0;
 #if defined(OPEN_MPI)
     const char* const compiledFor = "Open MPI";
@@ -72,7 +72,7 @@ inline void requireMpiOfHeaders()
                                      compiledFor, static_cast<int>(std::strcspn(text, ",\n")), text));
 }
 
-// Ends the process, and says why, if MPI_Finalize() is called while this object lives. For transports that another
+// If MPI_Finalize() is called while this object lives, ends the process and says why. For transports that another
 // thread polls, which might call MPI at that time. (MPI_Finalize() deletes the attributes of MPI_COMM_SELF first.)
 class NoFinalize {
 public:

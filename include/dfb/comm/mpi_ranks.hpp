@@ -1,5 +1,5 @@
-// MpiRanks: the ranks of an MpiTransport, which find each other when it is made. They duplicate the caller's
-// communicator, compare the formats of their packets, and share memory with the ranks of their node.
+// MpiRanks: the ranks of an MpiTransport. When it is made, they duplicate the caller's communicator, compare the
+// formats of their packets, and share memory with the ranks of their node.
 //
 // In every version of this file, ranks first duplicate the communicator and gather the 8 bytes of their packetFormat on
 // it. No version may change that.
@@ -39,7 +39,7 @@ public:
 
     // Collective over `communicator`. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator; TransportError
     // on all ranks if they were built with different packet formats, and on one alone if a collective of MPI fails
-    // there. Of anything else that goes wrong on a rank, all ranks learn in firstFailed().
+    // there. firstFailed() tells all ranks of anything else that goes wrong on one.
     MpiRanks(MPI_Comm communicator, MemoryPool& pool)
     {
         if (communicator == MPI_COMM_NULL)
@@ -65,7 +65,7 @@ public:
     }
 
     // Runs a step that a rank does alone. A rank that fails does no more such steps. It still takes part in the steps
-    // that all ranks do together, as they wait for it there, until firstFailed() tells them.
+    // of all ranks, which would wait for it, until firstFailed() tells them.
     void attempt(FunctionRef<void()> step)
     {
         if (wrong_[0] != 0)

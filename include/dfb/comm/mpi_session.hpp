@@ -22,7 +22,7 @@
 DFB_NAMESPACE_BEGIN
 
 // One object in a process. Make it before the framebuffers, compositors and walls, so that it is destroyed after them.
-// The constructor's thread is the one that may call MPI below MPI_THREAD_SERIALIZED (see Progress).
+// Below MPI_THREAD_SERIALIZED only the constructor's thread may call MPI (see Progress).
 class MpiSession {
 public:
     // Initialises MPI at this thread level or a higher one; without `level` at the highest that the library has. With
@@ -34,8 +34,8 @@ public:
     MpiSession& operator=(const MpiSession&) = delete;
 
     // Waits for all ranks, then finalises MPI, unless that has been done. Collective. If an exception destroys this
-    // object, it waits for nobody, as other ranks may wait for messages that never come. The program can still report
-    // the exception; when the process exits, it aborts the job with code 1.
+    // object, it waits for no other rank: they may wait for messages that never come. The program can still report the
+    // exception; when the process exits, it aborts the job with code 1.
     ~MpiSession();
 
     // Call it to go on after a TransportError. Other ranks may have gone, and MPI_Finalize would wait for them for
@@ -88,9 +88,8 @@ DFB_COMPILED_ONCE MpiSession::~MpiSession()
         abortJob();
 }
 
-// If all ranks end with the same exception, they come here together. So this waits until all can have reported it, half
-// a second at most. Then it waits for the launcher, which may drop output that a rank has written just before
-// MPI_Abort.
+// If all ranks end with one exception, they come here together. So this waits, half a second at most, until all can
+// have reported it. Then it waits for the launcher, which may drop output that a rank writes just before MPI_Abort.
 DFB_COMPILED_ONCE void MpiSession::abortJob()
 {
     if (detail::mpiSays(MPI_Finalized))
@@ -116,10 +115,9 @@ DFB_COMPILED_ONCE void MpiSession::finalize()
     MPI_Finalize();
 }
 
-// MPI_Finalize of MPICH 4 hangs now and then where ranks are connected by TCP: each rank waits for the others to answer
-// what is left in its connections, but a rank that has got further answers no more. It does not hang if no connection
-// is in use and nothing new has come on them for a while. With more than `most` ranks, opening all connections would
-// cost too much.
+// MPI_Finalize of MPICH 4 sometimes hangs where ranks are connected by TCP: each rank waits for answers of the others
+// on its connections, but a rank that is already further on answers no more. It does not hang if the connections have
+// been idle for a while. With more than `most` ranks, opening all would cost too much.
 DFB_COMPILED_ONCE void MpiSession::partFromAll()
 {
 #if defined(MPICH_VERSION)

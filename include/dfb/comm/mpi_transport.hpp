@@ -1,14 +1,14 @@
 // MpiTransport: ranks are MPI processes.
 //
-// All MPI calls are made by the constructor, the destructor, poll(), stop() and abort(), and none of them waits in a
-// call that blocks, because MPI libraries spin there: a caller that has to wait tests and naps. Works on a duplicate of
-// the caller's communicator; never initialises or finalises MPI.
+// Only the constructor, the destructor, poll(), stop() and abort() communicate by MPI. None of them waits in a blocking
+// call, because MPI libraries spin there: a caller that has to wait tests and naps. Works on a duplicate of the
+// caller's communicator; never initialises or finalises MPI.
 //
 // Small messages to one rank travel together, in packets (comm/packet.hpp) of at most 8 KiB, which the libraries send
 // without asking the receiver first. A larger message is announced in a packet. To a rank of the same node the packet
 // says where it lies in memory that both see (comm/node_memory.hpp), and nothing is copied. Otherwise it is sent on its
-// own under the tag that the announcement names, so that it goes straight into the block that the handler gets.
-// Receives of packets are posted beforehand: nothing is ever probed for. They take 64 KiB per transport.
+// own, under the tag that the announcement names, straight into the block that the handler gets. Receives of packets
+// are posted beforehand, so there is no probing. They take 64 KiB per transport.
 #pragma once
 
 #include <dfb/base/fifo.hpp>
@@ -50,12 +50,11 @@ public:
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // the most that one call sends: counts are ints
 
     // Collective over `communicator`. Waits for all ranks. Throws InvalidArgument for MPI_COMM_NULL or an
-    // intercommunicator. Throws TransportError if MPI is not initialised, or is finalised, or is not the
-    // one of the headers, and below MPI_THREAD_SERIALIZED on any thread but the one that initialised it. Throws
-    // TransportError on all ranks if they were built with different packet formats, or if one of them cannot make its
-    // transport; the error then has that rank and the reason, such as that `progress` is Thread and MPI is below
-    // MPI_THREAD_MULTIPLE there. Only if a collective of MPI fails on one rank, or finds no memory there for its
-    // result, the others wait.
+    // intercommunicator. Throws TransportError if MPI is not initialised, is finalised, or is another one than that of
+    // the headers, and below MPI_THREAD_SERIALIZED on any thread but the one that initialised it. Throws TransportError
+    // on all ranks if they were built with different packet formats, or if one of them cannot make its transport; the
+    // error then has that rank and the reason, such as that `progress` is Thread and MPI is below MPI_THREAD_MULTIPLE
+    // there. But if a collective of MPI fails on one rank, or there is no memory for its result, the other ranks wait.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : onlyThread_(onlyThread()),
           noFinalize_(progress != Progress::Caller && detail::mpiLevel() == MPI_THREAD_MULTIPLE),
@@ -81,7 +80,7 @@ public:
             release();
     }
 
-    // True if any thread may call MPI while others do. Also false if MPI is not there: the constructor says why.
+    // True if any thread may call MPI while others do. Also false if MPI cannot be used: the constructor then says why.
     static bool mayHaveThread(const Communicator&) noexcept
     {
         return detail::mpiSays(MPI_Initialized) && !detail::mpiSays(MPI_Finalized)
@@ -114,7 +113,7 @@ public:
     {
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
     }
-    // Naps of less than 10 ms are longer where ranks share cores, because waking up takes the core from a rank that
+    // Where ranks share cores, naps of less than 10 ms are longer, because waking up takes the core from a rank that
     // computes. If all that this rank waits for comes from this node, naps are long, since the doorbell ends them.
     void nap(std::chrono::nanoseconds limit)
     {
@@ -151,8 +150,8 @@ public:
         return outbox_.empty() && !sending_;
     }
 
-    // If it fails, it tells the other ranks, which would wait for this one; their poll() then fails with the same
-    // error. Afterwards nothing is sent but that, and nothing received.
+    // If it fails, it tells the other ranks, which would wait for this one: their poll() then fails with that error.
+    // After that it sends and receives nothing else.
     bool poll()
     {
         // At MPI_THREAD_SERIALIZED threads of several connections come here, each with another lock.
@@ -165,8 +164,8 @@ public:
         return !failed_ && guarded([this] { return move(); });
     }
 
-    // An orderly stop is collective: it serves the other ranks until all have called stop(), then goes on until all
-    // messages have come. MPI has no request of this transport left then.
+    // An orderly stop is collective: it moves messages until all ranks have called stop() and all messages have come.
+    // Then MPI has no request of this transport left.
     void stop(bool orderly)
     {
         if (detail::mpiSays(MPI_Finalized)) {
@@ -217,7 +216,7 @@ private:
         int found = 0;
         check(MPI_Comm_get_attr(comm(), MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
         lastTag_ = found ? std::min(*tagBound, 1 << 20) : 32767;
-        // The square of the number of ranks per core: that many ranks wake up, and each takes the core from that many.
+        // The square of the number of ranks per core: so many ranks wake up, and each delays as many.
         const std::int64_t ranksPerCore =
             std::int64_t{4} * sharingRanks() / Processors::ofThisThread().count(); // in quarters
         oversubscription_ = static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
@@ -229,8 +228,7 @@ private:
     }
 
     // Whether send() ends the nap under way. While nobody waits here (naps are long), a renderer sends tile after tile.
-    // Waking the polling thread for each of them would take more CPU time than sending it, and they pack better
-    // together.
+    // To wake the polling thread for each would take more CPU time than sending it, and several fit into one packet.
     bool mayWake()
     {
         if (napLimit_.load() < std::chrono::milliseconds(1))
@@ -301,7 +299,7 @@ private:
         handler_->fail(error);
     }
 
-    // Tells all other ranks, as far as possible: MPI itself may have failed.
+    // Tries to tell all other ranks: MPI itself may have failed.
     void tellFailure(const std::string& text)
     {
         try {
@@ -609,11 +607,10 @@ private:
         return moveUntil([&] { return completed(request); });
     }
 
-    // Once nothing waits to be sent on any rank, none of them needs an answer. Until then each gives signs of life, so
-    // that none is taken for lost while others still move messages. Then each rank says goodbye to those that it has
-    // sent to, with an empty packet sent synchronously: when that send has completed, the receiver has all packets that
-    // went before. Once this is so on all ranks, only announced bodies can be on the way. Returns false as moveUntil()
-    // does.
+    // First waits until nothing waits to be sent on any rank. Meanwhile each rank gives signs of life, so that none is
+    // taken for lost while others still move messages. Then each rank says goodbye to those that it has sent to, with
+    // an empty packet sent synchronously. When that send has completed, the receiver has all packets that went before.
+    // Once this is so on all ranks, only announced bodies can be on the way. Returns false as moveUntil() does.
     bool finish()
     {
         if (!barrier() || !moveUntil([this] { return quiet(); }) || !barrier())
@@ -674,8 +671,8 @@ private:
         }
     }
 
-    // Leaves to MPI the requests that cannot be taken back, with their buffers, which it may still use, and the
-    // communicator, because freeing that is collective.
+    // Leaves to MPI the requests that cannot be cancelled, with their buffers, which it may still use. Leaves it the
+    // communicator, too, because freeing that is collective.
     void abandon()
     {
         int done = 0;

@@ -1,9 +1,9 @@
-// NodeMemory: memory that the processes of one node all see, so that messages between them are not copied. The sender
-// tells where a block lies, and the receiver reads it there and gives it back. It also has a doorbell for each process.
+// NodeMemory: memory that all processes of one node see, so that messages between them are not copied. The sender says
+// where a block lies; the receiver reads it there and gives it back. It also has a doorbell for each process.
 //
-// The memory has no name in the file system that could be left behind: others reach it through the process that made
-// it, and it is gone when nobody has it mapped any more. Linux only; elsewhere, or where a process may not look at
-// another, there is no such memory.
+// The memory has no name in the file system that could be left behind. Others reach it through the process that made
+// it, and it ends when no process maps it any more. Linux only; elsewhere, or where a process may not look at another,
+// there is no such memory.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -44,7 +44,7 @@ public:
         {
         }
 
-        // To be called before looking for messages: rings up to now need not end a nap.
+        // Call it before looking for messages: rings before that need not end a nap.
         void look() noexcept { heard_ = doorbell_.word_.load(); }
 
         // Naps for `limit`, or until it is interrupted, or, with `isAwaiting`, until a rank rings. Ends at once if it
@@ -204,7 +204,7 @@ public:
 
     // placeOf(): where a block lies, in units of `alignment`, for others. borrow(): the first `byteCount` bytes of a
     // block that the process which owns this memory has lent; the Buffer gives it back at its end. Empty if no lent
-    // block can be there, or if somebody has it already, because it would be given back twice.
+    // block can be there, or if it is borrowed already: it would be given back twice.
     std::int32_t placeOf(const std::byte* block) const noexcept
     {
         return static_cast<std::int32_t>(static_cast<std::size_t>(block - base_) / alignment);
@@ -230,8 +230,7 @@ public:
     }
 
 private:
-    // In front of each block. As a float `lent` is a NaN that nobody makes, so that pixels are never mistaken for it,
-    // wherever a place may point to.
+    // In front of each block. As a float `lent` is an unusual NaN, so that a wrong place does not take pixels for it.
     static constexpr std::uint32_t mine = 0, lent = 0xffa5d3b7, borrowed = 1;
     struct alignas(alignment) State {
         std::atomic<std::uint32_t> is{mine};

@@ -1,6 +1,6 @@
 // Packets: several small messages to one rank travel as one message of the network. In a packet, each follows a record.
-// A large message is only announced: its record says that it follows as a message of its own, or where it lies in
-// memory that the receiver sees.
+// A large message is only announced: its record says that it follows by itself, or where it lies in memory that the
+// receiver sees.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -24,8 +24,8 @@ static_assert(sizeof(PacketRecord) == 16);
 
 constexpr std::size_t packetBytes = 8192; // at most
 
-// The format of packets, and of all else that transports over a network send each other. To be raised with every
-// change: ranks built with different formats cannot read each other's packets, and find out before the first one.
+// The format of packets, and of all else that transports over a network send each other. Raise it with every change:
+// ranks with different formats cannot read each other's packets, and find that out before the first one.
 constexpr std::uint64_t packetFormat = 3;
 
 // The bytes of a record and its payload in a packet: records begin at multiples of 16.

@@ -1,6 +1,6 @@
 // ProgressThread: calls poll() of a link so that messages move while the renderer works. It polls for a few
-// microseconds after the last message, then naps. The naps are longer if less comes, and shorter while somebody waits.
-// Between polls it calls a function for work that is due at certain times, such as the heartbeat.
+// microseconds after the last message, then naps. Naps are longer if fewer messages come, and shorter while a thread
+// waits. Between polls it calls a function for work that is due at certain times, such as the heartbeat.
 #pragma once
 
 #include <dfb/comm/transport.hpp>
@@ -23,8 +23,8 @@ class ProgressThread {
 public:
     using Clock = std::chrono::steady_clock;
 
-    // Does not start the thread yet. `link` must live until stop(). The thread calls `between` if there has been a poll
-    // since it did so last. With nothing to do it sleeps for `longestNap` at most.
+    // Does not start the thread yet. `link` must live until stop(). Between polls the thread calls `between`. With
+    // nothing to do it sleeps for `longestNap` at most.
     ProgressThread(Link& link, Clock::duration longestNap, std::function<void(Clock::time_point now)> between)
         : link_(link), longestNap_(longestNap), between_(std::move(between))
     {
@@ -96,8 +96,8 @@ public:
 private:
     static constexpr std::chrono::microseconds pollTime{5};
 
-    // Waking up costs some 10 us of a core, which rendering threads lose. While nobody waits here, a message that is
-    // taken a little later delays nobody; a message that this rank sends ends the nap anyway.
+    // Waking up costs rendering threads some 10 us of a core. While no thread waits here, a message may be taken a
+    // little later. A message that this rank sends ends the nap anyway.
     Clock::duration napAfter(Clock::duration idle, bool quiet) const
     {
         using std::chrono::microseconds;

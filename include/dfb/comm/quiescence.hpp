@@ -1,11 +1,11 @@
 // Quiescence: finds out whether anything is still under way among ranks that all wait. If not, they would wait for
 // ever.
 //
-// The ranks do this together, in rounds. In each round a rank reports once, at a moment at which it rests, how many
-// messages it has sent and how many it has taken; only messages that make their receiver do something count. A rank
-// that has something to do reports later, and the others wait for its report. If two consecutive rounds have the same
-// sums, and as many messages were taken as sent, then nobody has sent or taken anything in between, and nothing was on
-// the way at the end of the first round: so nothing ever will be (Mattern, "Algorithms for distributed termination
+// The ranks do this together, in rounds. In each round a rank reports once, when it rests, how many messages it has
+// sent and how many it has taken. Only messages that make their receiver do something count. A rank that has something
+// to do reports later, and the others wait for its report. Suppose that two consecutive rounds have the same sums, and
+// that as many messages were taken as sent. Then no rank has sent or taken anything in between, and nothing was on the
+// way at the end of the first round: so nothing ever will be (Mattern, "Algorithms for distributed termination
 // detection", 1987). One round is no proof: a rank that has reported may send a message to one that has not, which
 // takes it before it reports.
 #pragma once

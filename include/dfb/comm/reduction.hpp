@@ -1,7 +1,7 @@
 // ReductionTable: non-blocking all-reduce operations made of messages, along a binomial tree rooted at rank 0.
 //
-// Each reduction has a key. So any number of reductions may be under way, contributions may come before this rank takes
-// part, and contributions to an abandoned reduction are recognised.
+// Each reduction has a key. So any number may be under way, parts may come before this rank takes part, and parts of an
+// abandoned reduction are recognised.
 #pragma once
 
 #include <dfb/comm/message.hpp>
@@ -102,8 +102,8 @@ public:
         return find(key) != nullptr;
     }
 
-    // A message that this rank waits for in a reduction that it has entered: a part from a child, which stands for the
-    // ranks from the child to `last`; or, if all parts are here, the result from the parent, which has a lower rank.
+    // A message that this rank waits for in a reduction that it has entered: a part from a child, for the ranks from
+    // the child to `last`; or, if all parts are here, the result from the parent.
     struct Missing {
         int rank, last;
     };

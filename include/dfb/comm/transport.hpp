@@ -1,5 +1,5 @@
-// The contract of a transport: how bytes get from rank to rank. A transport is passive: it makes progress only when
-// somebody calls poll(). It knows nothing of tiles.
+// The contract of a transport, which carries bytes from rank to rank. It is passive: it moves messages only in poll(),
+// unless needsPolling() is false. It knows nothing of tiles.
 //
 //   using Communicator = ...;                   the program's handle of a group of ranks and of this rank in it
 //   T(const Communicator&, std::shared_ptr<MemoryPool>, Progress);
@@ -99,7 +99,7 @@ protected:
     ~TransportHandler() = default;
 };
 
-// nap() and interrupt() on a condition variable, for transports that have nothing better.
+// nap() and interrupt() by a condition variable, for transports without a way of their own.
 class NapSignal {
 public:
     void nap(std::chrono::nanoseconds limit)
@@ -185,8 +185,8 @@ inline constexpr bool is_transport_v = detail::has_communicator_v<T>&& detail::h
 
 inline constexpr std::int64_t bytesOfPlace = 64;
 
-// Link: an abstract class that hides the type of a transport, so that its users need not be templates. Its members are
-// those of the contract above.
+// Link: an abstract class that hides the type of a transport, so that its users need not be templates. For its members
+// see the contract above.
 class Link {
 public:
     virtual ~Link() = default;
