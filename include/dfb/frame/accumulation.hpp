@@ -1,4 +1,4 @@
-// Accumulation: which samples of its pixels a frame takes, and whether they continue those of the last frame.
+// Accumulation: which samples a frame takes, and whether they continue those of the last frame.
 #pragma once
 
 #include <dfb/frame.hpp>

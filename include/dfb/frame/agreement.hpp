@@ -243,7 +243,7 @@ inline void checkConfig(const FrameBufferConfig& c, const OperationTraits& opera
 
 // Finds out whether all ranks have the same configuration, which makeMine() returns, and returns what all have.
 // Collective. Throws InvalidArgument on all ranks if the configurations differ or makeMine() throws on any rank. No
-// rank throws before all know the reason: the first to throw may destroy the connection, and a rank that has not heard
+// rank throws before all know the reason: the first to throw may destroy the connection, and a rank that does not know
 // the reason by then would report another error.
 inline Agreement agree(Mailbox& mailbox, FunctionRef<Agreement()> makeMine)
 {

@@ -1,11 +1,10 @@
 // Declarations: every rank tells the owners which inputs it will send, and all ranks learn when all owners know. Counts
 // come from the senders only, so owner and contributor cannot disagree about visibility.
 //
-// A rank's declaration holds until the rank declares something else. In each frame a rank sends a manifest to those
-// owners alone for which its inputs are not those of the last frame. The owner acknowledges a manifest and drops the
-// rank's older one. A rank enters a reduction when all of its manifests are acknowledged, or at once if it had none to
-// send. When the reduction is done, every manifest has arrived, and owners know that ranks without a new manifest send
-// the same inputs as before.
+// A rank's declaration holds until the rank declares something else. In each frame a rank sends a manifest only to the
+// owners for which its inputs differ from the last frame's. The owner acknowledges a manifest and drops the rank's
+// older one. A rank enters a reduction when all of its manifests are acknowledged, or at once if it sent none. When the
+// reduction is done, every manifest has arrived, and ranks without a new manifest send the inputs of before.
 #pragma once
 
 #include <dfb/comm/message.hpp>

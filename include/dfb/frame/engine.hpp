@@ -1,6 +1,5 @@
-// Engine: the interface to the implementation of a framebuffer: frames of one set of tiles, one at a time, with
-// operations of any type. The implementation is in frame/frame_engine.hpp, which a program that links dfb::compiled
-// does not compile.
+// Engine: the interface of a framebuffer's implementation, for one frame at a time and operations of any type. The
+// implementation is in frame/frame_engine.hpp; a program that links dfb::compiled does not compile it.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
@@ -67,8 +66,8 @@ public:
     virtual void abort(std::int64_t frame, const std::exception_ptr& reason, int tile) = 0;
     virtual void requireProgress() const = 0;
     virtual void tryVote() = 0; // again, when messages have moved
-    // Gives this engine all engines of its framebuffer: when one has moved messages, all try to vote. Before this call
-    // it is alone.
+    // Gives this engine all engines of its framebuffer: when one has moved messages, all try to vote. Until then it
+    // knows only itself.
     virtual void setTogether(std::vector<Engine*> engines) = 0;
     virtual bool isDone() = 0;
     virtual FrameReport end() = 0;

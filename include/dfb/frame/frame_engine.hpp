@@ -273,7 +273,7 @@ public:
         mailbox_->executor().parallelFor(count, body, meanwhile);
     }
 
-    // Polls if no other thread moves messages, or none runs tasks, for a renderer that does not call poll(). Does so at
+    // For a renderer that does not call poll(): polls if no other thread moves messages, or none runs tasks. Does so at
     // most once in a millisecond, as a poll takes time.
     void pollNowAndThen()
     {
@@ -293,7 +293,7 @@ public:
     {
         if (renderNs_ >= 0)
             return;
-        // In a frame that may be partial, a reason says why declare() was not called.
+        // In a frame that may be partial, the failure says why declare() was not called.
         if (params_.declared && !declarations_.declared() && !outcome_->failed())
             outcome_->failWhole(open_.reason().value_or(
                 errorInfo(ErrorKind::InvalidArgument, "end() of a frame with declared inputs without declare()")));
@@ -366,7 +366,7 @@ public:
                 });
             end();
         } catch (...) {
-            // A FrameError, which says what failWhole() was told, or a TransportError, which the next begin() throws.
+            // A FrameError with the reason given to failWhole(), or a TransportError, which the next begin() throws.
         }
     }
 
@@ -496,7 +496,7 @@ private:
     }
 
     // The display rank tells the ranks that see its memory where its image lies, so that they put finished tiles there
-    // themselves. A rank that has not heard of it by the end of its first frame goes on sending tiles.
+    // themselves. A rank that gets this message only after its first frame goes on sending its tiles.
     void tellImagePlace()
     {
         if (rank() != config_.image.displayRank)
@@ -515,8 +515,8 @@ private:
         }
     }
 
-    // Nobody knows which frame the message was for. If no frame is open, or this rank has all that it needs for the
-    // open one, then the next frame lacks the message.
+    // It is not known which frame the message was for. If no frame is open, or this rank has all that it needs for the
+    // open one, the next frame lacks the message.
     void undecodable(const ErrorInfo& error) override
     {
         mailbox_->keepDamage(error);                         // first: begin() opens the frame and then looks for damage

@@ -1,5 +1,4 @@
-// HiddenTiles: which inputs of a tile cannot be seen because an opaque input lies in front of them, and which may still
-// turn out to be hidden.
+// HiddenTiles: which inputs of a tile are hidden by an opaque input in front of them, and which may still be.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -15,7 +14,8 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// One object per rank, with the words that this rank has received. Any thread may call the members, except newFrame().
+// One object per rank, with the messages (words) that this rank has received. Any thread may call the members, except
+// newFrame().
 class HiddenTiles {
 public:
     // The effect of an input on those behind it.

@@ -1,6 +1,6 @@
-// The jobs of a frame that every rank could do. Half of them are shared out beforehand, the other half on demand by
-// guided self-scheduling (Polychronopoulos and Kuck 1987): shares shrink with the work that is left. JobShare has the
-// numbers, JobExchange the messages.
+// The jobs of a frame that any rank can do. Half of them are shared out beforehand, the other half on demand by guided
+// self-scheduling (Polychronopoulos and Kuck 1987): shares shrink with the work that is left. JobShare has the numbers,
+// JobExchange the messages.
 #pragma once
 
 #include <dfb/base/fifo.hpp>

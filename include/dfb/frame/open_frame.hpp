@@ -1,10 +1,9 @@
-// OpenFrame: the frame that is open on this rank, as a state machine (drawn in docs/architecture.md): its states, who
-// causes a transition, what belongs to it, and what it still waits for.
+// OpenFrame: the frame that is open on this rank, as a state machine (drawn in docs/architecture.md). It knows which
+// messages and tasks belong to the frame, and what the frame still waits for.
 //
 // The thread that is in begin() or end() calls open(), finish() and close(). Any thread calls fail(). Any thread calls
-// vote() when it may have brought about the last thing to wait for. The thread that takes the result of the vote calls
-// decide(). close() is right in every state: if the transport has failed, so that no verdict comes, it is called in
-// Voted or an earlier state.
+// vote() when it has done something that the vote may have waited for. The thread that takes the result of the vote
+// calls decide(). close() may be called in every state: if the transport has failed, no verdict comes.
 #pragma once
 
 #include <dfb/comm/message.hpp>
@@ -48,9 +47,9 @@ public:
 
     // ---- transitions
 
-    // Opens the next frame and returns its messages that came too early. The caller must take them before the next
-    // open(). With an error the frame has failed from the start, and the caller tells the others. Throws
-    // InvalidArgument if a frame is open.
+    // Opens the next frame and returns its messages that came before. The caller must take them before the next open().
+    // With an error the frame has failed from the start, and the caller tells the others. Throws InvalidArgument if a
+    // frame is open.
     std::vector<Arrival>& open(const std::optional<ErrorInfo>& error = std::nullopt)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -125,8 +124,8 @@ public:
             state_ = FrameState::Decided;
     }
 
-    // Lets nobody enter any more, and waits until all have left. `help()` runs work that some of them may be waiting
-    // for, and returns false if there is none.
+    // Lets no thread enter any more, and waits until all have left. `help()` runs work that they may be waiting for,
+    // and returns false if there is none.
     template <class Help>
     void close(const Help& help)
     {
@@ -219,7 +218,7 @@ public:
     struct Leave {
         void operator()(OpenFrame* frame) const { frame->leave(); }
     };
-    // Somebody who has entered, and who leaves when this is destroyed. Null: nobody.
+    // One entry, which ends when this is destroyed. Null: none.
     using Inside = std::unique_ptr<OpenFrame, Leave>;
 
     // Enters for work that is not a message. Null: frame `number` is not open, so the work must not go on.
@@ -231,8 +230,8 @@ public:
         return Inside(isOpen ? this : nullptr);
     }
 
-    // Enters once more from inside, for work that goes on after the caller has left. close() waits for that work too,
-    // even if it has begun to wait already.
+    // Enters once more from inside, for work that goes on after the caller has left. close() waits for that work, too,
+    // even if it is waiting already.
     Inside enterAgain()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -240,9 +239,9 @@ public:
         return Inside(this);
     }
 
-    // Inputs that are read in place lie in memory that their renderers use again when the frame has ended. So once the
-    // frame has an input that `isInPlace`, this rank does not vote while a task reads inputs. Returns false if the
-    // frame has failed: then inputs must not be read. Otherwise endReading() must follow.
+    // Inputs that are read in place lie in memory that their renderers use again after the frame. So once the frame has
+    // an input that `isInPlace`, this rank does not vote while a task reads inputs. Returns false if the frame has
+    // failed: inputs must then not be read. Otherwise endReading() must follow.
     bool beginReading(bool isInPlace = false)
     {
         const std::lock_guard<std::mutex> lock(mutex_);

@@ -87,8 +87,8 @@ public:
     {
     }
 
-    // Copies the data of a frame. Throws the exceptions of the copies and of the pixel operation. No other member may
-    // be running.
+    // Copies the tile operation's data, and calls newFrame() of the pixel operation. Throws the exceptions of both. No
+    // other member may be running.
     void newFrame(const TileFrameData& tileData, [[maybe_unused]] const PixelFrameData& pixelData)
     {
         tileData_ = tileData;

@@ -1,5 +1,5 @@
-// FrameOutcome: how the open frame ends: what makes it fail, what end() waits for, and the one reduction in which all
-// ranks learn the same verdict.
+// FrameOutcome: how the open frame ends. It decides what makes the frame fail and what end() waits for, and has the
+// reduction by which all ranks get one verdict.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
@@ -70,8 +70,8 @@ public:
         }
     }
 
-    // Opens the next frame, as OpenFrame::open() does. With `reason` it has failed before any message is taken: this
-    // rank's parameters may not be complete then, so messages could seem wrong.
+    // Opens the next frame, as OpenFrame::open() does. With `reason` it fails before any message is taken, because this
+    // rank's parameters may not be complete: messages could seem wrong.
     std::vector<Arrival>& open(std::optional<ErrorInfo> reason)
     {
         if (reason) {
@@ -87,8 +87,8 @@ public:
         return early;
     }
 
-    // Reports that something went wrong on this rank. The frame fails, or goes on without the lost part if it may be
-    // partial. Returns false if this rank has voted already, so that its vote does not contain the error.
+    // Reports an error on this rank. The frame fails, or goes on without the lost part if it may be partial. Returns
+    // false if this rank has voted already, so that its vote does not contain the error.
     bool fail(ErrorInfo reason)
     {
         if (!isBearable(reason.kind))
@@ -121,7 +121,7 @@ public:
         const auto matters = [isPartial](const Buffer& message) {
             return isPartial && FinalGather::isFinishedTile(loadAs<MessageHeader>(message.data()).kind);
         };
-        // If something is missing, it may be credit. Then nobody waits for credit.
+        // If something is missing, it may be credit: then do not wait for credit.
         if (isMissing(why))
             isCreditInDoubt_ = true;
         mailbox_.flow().drop(matters, isPartial && !isMissing(why));
@@ -147,9 +147,8 @@ public:
         tryVote();
     }
 
-    // Ranks that were given different parameters may wait for different things, so that none of them would ever be
-    // done. A partial result from below in the tree shows the difference, because it was sent without waiting for this
-    // rank.
+    // Ranks with different parameters may wait for different things, and then none would ever be done. A partial result
+    // from below in the tree shows the difference, because it was sent without waiting for this rank.
     void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
     {
         const std::uint32_t scope = mailbox_.scopeOf(message);
@@ -161,7 +160,7 @@ public:
                 const int tileCount = tiles_.table().layout().tileCount();
                 if (!verdict.fits(tileCount))
                     failMalformed("a verdict on tiles that there are not", tileCount - 1);
-                // A rank that votes with an error has told all others why, unless they may go on without its part.
+                // A rank that votes with an error has told all others why, except in a frame that may be partial.
                 const bool isCause = verdict.error && !terms_.allowPartial;
                 differs = isUp && !isCause && !verdict.terms.difference(terms_).empty();
             } else if (scope == AllDeclared) {
@@ -186,8 +185,8 @@ public:
 
     // ---- the vote
 
-    // Enters the reduction of the frame's verdict when this rank has nothing left to do, or the frame has failed
-    // somewhere.
+    // Enters the reduction of the frame's verdict if this rank has nothing left to do, or the frame has failed on some
+    // rank.
     void tryVote()
     {
         if (mailbox_.failed() || !frame_.vote([this] { return isDone(); }, [this] { return mayVote(); }))
@@ -223,8 +222,7 @@ public:
     }
 
     // After beginEnd(): whether conclude() need not wait for the verdict any longer, because it is here or will not
-    // come. Also does the work of a rank that waits: it looks now and then whether any message is under way, and makes
-    // the frame fail when its time is up.
+    // come. It also checks now and then whether any message is under way, and makes the frame fail when its time is up.
     bool isConcluded()
     {
         if (isDecided() || mailbox_.failed())
@@ -327,10 +325,10 @@ private:
     // Whether this rank has nothing left to do and only waits for other ranks.
     bool isDone() const { return frame_.areTilesFinished() && tiles_.table().isSaid() && tiles_.gather().complete(); }
 
-    // If only end() moves messages, every message must have been taken before any rank may leave: a rank that polls no
-    // more takes nothing, and the sender would wait in end() for its message to go. In a frame that may be partial, a
-    // rank must not wait for credit after its vote either, as ranks that have left give none. But credit that may be
-    // lost must not hold up the vote: then finished tiles still have the time that waitForFinishedTiles() waits.
+    // If only end() moves messages, all must have been taken before any rank may leave: a rank that polls no more takes
+    // nothing, and the sender would wait in end() for its message to go. In a frame that may be partial, a rank must
+    // not wait for credit after its vote either, as ranks that have left give none. But credit that may be lost must
+    // not hold up the vote: finished tiles then have the time of waitForFinishedTiles().
     bool mayVote() const
     {
         const bool onlyCallers = mailbox_.connection().hasOnlyCallers();
@@ -343,9 +341,8 @@ private:
     bool isDecided() const noexcept { return frame_.state() == FrameState::Decided; }
     bool hasTimeout() const noexcept { return terms_.timeoutMs > 0; }
 
-    // Whether a damaged message was noticed that may have been part of the verdict, while no end of the wait is set
-    // yet. isConcluded() then sets one: the wait for the verdict is as long as that for a rank of which nothing is
-    // heard.
+    // Whether a damaged message may have been part of the verdict, and the wait has no end yet. isConcluded() then sets
+    // one: it waits for the verdict as long as for a rank that is silent.
     bool isVerdictInDoubt() const
     {
         return !givesUpAt_ && frame_.isDamaged() && mailbox_.connection().config().peerTimeout.count() > 0;
@@ -369,9 +366,9 @@ private:
         mailbox_.wait(areThere, Clock::now() + (hasTimeout() ? terms_.timeout() : std::chrono::seconds(2)));
     }
 
-    // The message of one round of quiescence_. Ranks that were given different parameters could wait for each other for
-    // ever. A round therefore carries the parameters. It shows a difference on its way up the tree as soon as two such
-    // ranks are in end(); see receiveReduction().
+    // The message of one round of quiescence_. It carries the parameters, because ranks with different ones could wait
+    // for each other for ever. A round shows a difference on its way up the tree as soon as two such ranks are in
+    // end(); see receiveReduction().
     struct Round {
         FrameTerms terms;
         Quiescence::Report report;
@@ -439,7 +436,7 @@ private:
         return placed(std::move(info));
     }
 
-    // Adds to the message, which has a text, for which ranks' parts of a reduction this rank waits. Sets `from` if it
+    // Adds to the message, which has a text, the ranks whose parts of a reduction are missing here. Sets `from` if it
     // can only be one rank.
     void addWaitedFor(ErrorInfo& info, const ReductionKey& key)
     {

@@ -56,7 +56,7 @@ public:
     {
         return static_cast<ChannelMask>(config.image.aux | (config.image.depth ? depthChannel : 0));
     }
-    // Returns the channels of an input that somebody reads: the operation, the image, or the search for the nearest of
+    // Returns the channels of an input that are read: by the operation, the image, or the search for the nearest of
     // several passes, which gives position and ids (`comparesPasses`). `isOrdered`: the operation does without depth.
     static ChannelMask travelling(const OperationTraits& traits, const FrameBufferConfig& config,
                                   bool comparesPasses = true, bool isOrdered = false)
@@ -331,8 +331,8 @@ public:
         });
     }
 
-    // Adds what is known up to now of this frame's inputs and of this rank's tiles, and an error if pixels have changed
-    // since notePromise() and there is no other.
+    // Adds the counts of this frame's inputs and of this rank's tiles. Adds an error if pixels have changed since
+    // notePromise() and there is no other error.
     void addTo(Verdict& verdict)
     {
         const TileInfo& frame = table_.frameInfo();

@@ -1,5 +1,5 @@
-// TileTable: the tiles that this rank owns: per tile a tile operation, and per pass a dependency tracker.
-// Nothing is made for a tile before its first input.
+// TileTable: the tiles that this rank owns. A tile has a tile operation, and a dependency tracker for each pass. They
+// are made when first needed.
 #pragma once
 
 #include <dfb/blend/background_pixels.hpp>
@@ -103,14 +103,13 @@ public:
                 series.next = s.first + s.count;
             }
     }
-    // Call it once the error of a spoilt tile has been reported. A frame may end only when isSaid(): all of them have
-    // been.
+    // saidWhy(): call it when the error of a spoilt tile has been reported. isSaid(): all have been; only then may a
+    // frame end.
     void saidWhy() { --unsaid_; }
     bool isSaid() const noexcept { return unsaid_ == 0; }
 
-    // The number of inputs that have come to tiles of this rank and with which nothing was wrong. If all tiles are
-    // complete, the numbers of all ranks add up to the number of inputs sent. If they do not, one input too many has
-    // come before one that was meant.
+    // The number of right inputs that have come to tiles of this rank. If all tiles are complete, the numbers of all
+    // ranks add up to the number of inputs sent. If they do not, a wrong input has come in place of a right one.
     std::int64_t arrivedCount() const noexcept { return arrived_; }
     // The number of tiles that needed no more inputs although more were to come.
     std::int64_t endedEarlyCount() const noexcept { return endedEarly_; }
@@ -128,8 +127,8 @@ public:
         bool spoilt = false; // the tile is spoilt: call saidWhy() when its error has been reported
     };
 
-    // Hands an input of rank `from` to its tile. Throws the exceptions of the tracker and of the operation. Then the
-    // tile is spoilt and waits for no more inputs, so both members of `arrival` may be set.
+    // Hands an input of rank `from` to its tile. Throws the exceptions of the tracker and of the operation; the tile is
+    // then spoilt and waits for no more inputs, so both members of `arrival` may be set.
     void arrive(Fragment&& fragment, int from, Arrival& arrival)
     {
         const TileHeader h = fragment.header();
@@ -159,8 +158,8 @@ public:
         }
     }
 
-    // The tile will not get all of its inputs. Returns true if it still waits for some: then call finish() once, as it
-    // is spoilt. Its error must have been reported. Throws std::bad_alloc.
+    // Spoils the tile, which will not get all of its inputs. Returns true if it still waited for some: then call
+    // finish() once. The error must have been reported. Throws std::bad_alloc.
     bool lose(int tile)
     {
         const std::lock_guard<std::mutex> lock(mutexOf(tile));
@@ -176,11 +175,11 @@ public:
         return spoil(*slotOf(tile));
     }
 
-    // Takes the inputs that each tile will get in each pass; a tile that is not named gets none. First calls
-    // `counted(tile)` for each tile that waits for inputs, then `ready(tile)` for each tile whose inputs are all there.
-    // Also calls them for tiles without inputs if the pixel operation is not pointwise. `expected` must live as long as
-    // the frame. If the tracker or the operation throws, this goes on with the other tiles and throws at the end;
-    // `where` then names the first tile that failed.
+    // Takes the inputs that each tile will get in each pass; a tile that is not named gets none. Calls `counted(tile)`
+    // for each tile with inputs, and then `ready(tile)` if they are all there. Also calls both for tiles without inputs
+    // if the pixel operation is not pointwise. `expected` must live as long as the frame. If the tracker or the
+    // operation throws, this goes on with the other tiles and throws at the end; `where` then names the first tile that
+    // failed.
     template <class Counted, class Ready>
     void declare(const ExpectedInputs& expected, ErrorInfo& where, const Counted& counted, const Ready& ready)
     {
@@ -217,7 +216,7 @@ public:
             std::rethrow_exception(failure);
     }
 
-    // Whether something was wrong with the tile's inputs, so that it must not be finished. The tile must be complete.
+    // Whether an input of the tile was wrong, so that it must not be finished. The tile must be complete.
     bool isSpoilt(int tile)
     {
         const std::lock_guard<std::mutex> lock(mutexOf(tile));
@@ -333,7 +332,7 @@ private:
     }
 
     // Returns the slot, set up for this frame. The first call in a frame throws the exceptions of the op's constructor
-    // and of its newFrame(): then the tile is spoilt.
+    // and of its newFrame(). The tile is then spoilt.
     Slot& slotFor(int tile)
     {
         auto& slot = slotOf(tile);
@@ -383,7 +382,7 @@ private:
 
     // Whether the samples of this frame follow those of the tile in earlier ones.
     bool goesOn(int tile) const { return traits().keepsState && series_[static_cast<std::size_t>(tile)].goesOn; }
-    // Whether the operation has had any of those earlier samples. Then it gets this frame's, too, even if they are
+    // Whether the operation has had any of those earlier samples. It then gets this frame's, too, even if they are
     // empty.
     bool hasSamples(int tile)
     {
@@ -419,7 +418,7 @@ private:
         return std::all_of(slot.trees.begin(), slot.trees.end(), [](const auto& tree) { return tree.complete(); });
     }
 
-    // Returns whether to finish the tile now; otherwise declare() will see it, or nobody waits.
+    // Returns whether to finish the tile now. If not, declare() will, or that has begun already.
     bool spoil(Slot& slot)
     {
         slot.spoilt = true;

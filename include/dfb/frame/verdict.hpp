@@ -1,6 +1,6 @@
-// Verdict: the content of the reduction that ends each frame. It says whether any rank failed and which error all ranks
-// report, and has the figures of the frame that are sums or maxima over the ranks. FrameTerms: the parameters of the
-// frame that must be equal on all ranks.
+// Verdict: the content of the reduction that ends each frame: the error that all ranks report, if any, and the figures
+// of the frame that are sums or maxima over the ranks. FrameTerms: the parameters of the frame that must be equal on
+// all ranks.
 #pragma once
 
 #include <dfb/comm/heartbeat.hpp>
@@ -281,9 +281,8 @@ struct Verdict {
                                                                : what + ": it must be the same on all ranks");
     }
 
-    // Returns an error if inputs came after their tiles had been finished: other inputs may have been taken in their
-    // place. If a tile was finished before all its inputs had come, nothing can be said, since those inputs may be
-    // late, too.
+    // Returns an error if inputs came after their tiles had been finished: others may have been taken in their place.
+    // Returns none if a tile was finished before all its inputs had come, since these inputs may come late, too.
     std::optional<ErrorInfo> strayInputs() const
     {
         const std::int64_t count = sums.tilesEndedEarly == 0 ? sums.inputsLeft : 0;
@@ -306,8 +305,8 @@ struct Verdict {
         return !isMissing(e.kind) ? 4 : e.tile >= 0 ? 3 : e.expected >= 0 ? 2 : 1;
     }
 
-    // Picks the error that all ranks report: the one with the greatest weight(); among equals, one that says which rank
-    // is waited for; then that of the lowest rank. Joins the texts about missing inputs.
+    // Picks the error that all ranks report: the one with the greatest weight(); of equal ones, one that names a rank
+    // that is waited for; then that of the lowest rank. Joins the texts about missing inputs.
     static ErrorInfo chosen(const ErrorInfo& a, const ErrorInfo& b)
     {
         constexpr std::size_t mostText = 2000;
@@ -331,8 +330,8 @@ struct Verdict {
             a.error = a.error ? chosen(*a.error, *b.error) : *b.error;
         if (a.differing.empty())
             a.differing = !b.differing.empty() ? b.differing : a.terms.difference(b.terms);
-        // Other errors follow from different parameters. But if a camera throws on one rank, that is why its
-        // FrameConfig::order is missing. Then there is no partial image, either.
+        // Other errors follow from different parameters. But if a camera throws on one rank, its FrameConfig::order is
+        // missing for that reason. Then there is no partial image, either.
         const bool isCause = a.error && a.error->kind == ErrorKind::UserCode;
         if (!a.differing.empty() && isCause && a.terms.allowPartial != 0)
             a.differing += printed("; rank %d: %s", a.error->rank, a.error->message.c_str());

@@ -32,11 +32,10 @@ namespace detail {
 // One object per rank and framebuffer. Any thread may call the members, except newFrame().
 class FinalGather {
 public:
-    // Sends a message to the display rank. `raw`: its size before a codec was to make it smaller; 0: there was no
-    // codec.
+    // Sends a message to the display rank. `raw`: its size before the codec; 0: there was no codec.
     using Send = std::function<void(Buffer&&, std::size_t raw)>;
     using OwnerOf = std::function<int(int tile)>;
-    // Gets what the codec or the program's onTile has thrown. `tile`: that of onTile; -1 for the codec.
+    // Takes an exception of the codec or of the program's onTile. `tile`: that of onTile; -1 for the codec.
     using Fail = std::function<void(const std::exception_ptr&, int tile)>;
 
     // Where a finished tile goes.
@@ -176,7 +175,7 @@ public:
     {
         if (!imageGate_ || imageGate_->close(std::chrono::seconds(1)))
             return;
-        // A writer is still inside, or has died there. The memory is left to it, and the image continues in a copy.
+        // A writer is still inside, or has died there. Leaves the memory to it, and goes on with a copy of the image.
         Image copy(*pool_, layout_.width(), layout_.height(), config_.image.format, channels_);
         const Planes from = image_.planes(), to = copy.planes();
         for (std::size_t c = 0; c < channelCount; ++c)
@@ -218,8 +217,8 @@ public:
         return place;
     }
 
-    // `writtenPixels`: how many pixels of the tile were written, as the others have not changed in the image. Returns
-    // false if the tile comes too late, after flush().
+    // `writtenPixels`: how many pixels of the tile were written; the others are in the image already. Returns false if
+    // the tile comes too late, after flush().
     bool commit(int tile, Place&& place, std::int64_t writtenPixels)
     {
         if (!enabled())
@@ -280,8 +279,8 @@ public:
         return true;
     }
 
-    // Call it when all tiles of this rank are committed, or those that are not come too late. Sends the rest, and how
-    // many tiles there were. Only the first call does anything.
+    // Call it when all tiles of this rank are committed, or when no other tile counts any more. Sends the last batch,
+    // and the number of tiles. Only the first call does anything.
     void flush()
     {
         if (!enabled() || !isSender(static_cast<std::size_t>(rank_)))
@@ -326,7 +325,7 @@ public:
             throw;
         }
     }
-    // Whether some of these messages have come but could not be taken in. They do not come again.
+    // Whether some of these messages could not be taken. They do not come again.
     bool hasLost() const noexcept { return hasLost_; }
 
     // Whether all tiles of the other ranks are in the image.
@@ -407,8 +406,8 @@ public:
         return imageFrame_ >= 0 && !std::binary_search(incomplete_.begin(), incomplete_.end(), tile);
     }
 
-    // The frame has failed: nothing in the image can be relied on. A rank that took itself for the owner of a tile may
-    // have written to the image of all.
+    // The frame has failed: no pixel of the image is certain. A rank with other owners than the rest may have written
+    // anywhere.
     void invalidate()
     {
         ++imageEpoch_;
@@ -448,7 +447,7 @@ private:
     bool isMissing(std::size_t r) const { return isSender(r) && !tilesOf_[r].isComplete(); }
 
     // Adds the tiles and messages that have come now; under mutex_. With a rank's last message its tiles must be as
-    // many as it has announced: thus a wrong count never ends a frame too early. Throws Error (MalformedMessage).
+    // many as it has announced, so that a wrong count never ends a frame too early. Throws Error (MalformedMessage).
     void addReceived(TilesOf& its, const SentCount& here)
     {
         its.received.tiles += here.tiles;

@@ -1,5 +1,5 @@
 // ImageGate: lets other processes write finished tiles straight into the image of the display rank, if they see its
-// memory. They may do so only while the frame is open there, and never in an image that a user may be looking at.
+// memory. They may do so only while the frame is open there: after that the program reads the image.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -17,8 +17,8 @@ DFB_NAMESPACE_BEGIN
 namespace detail {
 
 // Lies in shared memory. A writer first counts itself in and then looks whether the gate is open. close() first closes
-// the gate and then looks whether a writer is inside. So at least one of the two sees the other. The gate of an image
-// that is gone becomes that of another one (MemoryPool::acquireGate()), which lets no writer of the old image in.
+// the gate and then looks whether a writer is inside. So at least one of the two sees the other. When an image is gone,
+// another one uses its gate (MemoryPool::acquireGate()), and lets no writer of the old image in.
 class ImageGate {
     struct Leave {
         void operator()(ImageGate* gate) const noexcept { gate->writers_.fetch_sub(1); }

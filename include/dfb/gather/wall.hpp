@@ -144,8 +144,8 @@ private:
     };
     static constexpr std::size_t prefix = sizeof(MessageHeader) + sizeof(PartHeader);
 
-    // How many frames other ranks may be ahead of this one: those in flight, and some that have failed. A message of a
-    // later frame is refused, as each frame takes the memory of its pictures.
+    // How many frames other ranks may be ahead of this one: those in flight, and some that have failed. Messages of
+    // later frames are refused, as each frame takes memory for its pictures.
     static constexpr std::int64_t framesAhead = 16;
     static constexpr std::size_t framesKept = 16;
 
@@ -237,7 +237,7 @@ private:
         refuse(error.from, error, 0);
     }
 
-    // Notes that some frame misses a part now: the next one that ends, or one that has begun already. `frame`: the
+    // Notes that a part of some frame is missing: of the next one that ends, or of one that has begun. `frame`: the
     // frame that the message names.
     void refuse(int source, const ErrorInfo& error, std::int64_t frame)
     {
@@ -381,8 +381,8 @@ private:
         mailbox_->receiveReduction(source, header, message);
     }
 
-    // Under mutex_: how many pixels have not come to a display of this rank, and whether no more will come. These take
-    // no memory: a rank that has none left must not throw while others wait for it.
+    // Under mutex_: how many pixels have not come to a display of this rank, and whether no more will come. They
+    // allocate nothing: a rank without memory must not throw while others wait for it.
     std::int64_t pixelsLeft(std::int64_t frame, int display) const
     {
         const auto found = coming_.find(frame);
