@@ -1,5 +1,5 @@
-// Cpu: compiles loops a second time for processors with AVX2 and F16C, the conversion of half floats, and picks at run
-// time. FMA is not used, so that the results are the same, bit for bit. One loop also exists for AVX-512.
+// Cpu: compiles loops a second time for processors with AVX2 and F16C (conversion of half floats), and picks one at run
+// time. FMA is not used, so that both give the same bits. One loop also exists for AVX-512.
 //
 //   DFB_INLINE void body(...) { ... }
 //   fastest<body>(...);
@@ -56,7 +56,7 @@ inline bool cpuHasAvx2() noexcept
 #endif
 }
 
-// Whether the processor has AVX-512 and is of a kind that does not lower its clock for it: those that do lack VBMI2.
+// Whether the processor has AVX-512 and does not lower its clock for it. Those that lower it lack VBMI2.
 inline bool cpuHasAvx512() noexcept
 {
 #if defined(DFB_HAS_AVX2_CLONES)
@@ -79,9 +79,9 @@ inline auto fastest(Arguments... arguments) noexcept
     return DFB_FASTEST(Body, withAvx2<Body>, arguments...);
 }
 
-// Prefetches a piece of a row into the second-level cache, as no processor predicts where the next row begins. The
+// Prefetches a piece of a row into the second-level cache, as processors do not predict where the next row begins. The
 // first-level cache is too small: rows of an image are often a multiple of 4 KiB apart, so that rows of several inputs
-// evict each other. Always inlined, as GCC removes calls of functions that do nothing else.
+// evict each other. Always inlined, as GCC removes calls of functions that only prefetch.
 DFB_INLINE void prefetch(const std::byte* from, std::size_t bytes)
 {
 #if defined(__GNUC__)

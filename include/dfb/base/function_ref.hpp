@@ -1,4 +1,4 @@
-// FunctionRef: a reference to a callable, valid during the call to which it is an argument. It is two pointers, so a
+// FunctionRef: a reference to a callable, valid during the call that it is an argument of. It is two pointers. A
 // function that takes one need not be a template, which would be instantiated for each lambda. A FunctionRef that
 // returns nothing drops what the callable returns.
 #pragma once

@@ -1,5 +1,5 @@
 // Levels: converts rows of linear values to 8-bit levels, linear or sRGB, correctly rounded or dithered, or to floats.
-// Also returns how near any value came to a tie, so that the caller can decide that value with more digits.
+// Also returns how near the values are to ties, so that the caller can round again with more digits.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -32,8 +32,7 @@ inline std::uint8_t toUnorm8(double value) noexcept
     return static_cast<std::uint8_t>(static_cast<int>((clamped * 255.0 + shift) - shift));
 }
 
-// Rounds a value that is known to about 100 bits. A value that is too near to a tie to be told from it counts as the
-// tie.
+// Rounds a value that is known to about 100 bits. A value that may be a tie counts as one.
 inline std::uint8_t toUnorm8(const DoubleDouble& value) noexcept
 {
     if (!(value.high > 0.0))
@@ -244,11 +243,11 @@ DFB_AVX2 inline __m256 loadAsFloats(const double* values) noexcept
     return _mm256_set_m128(_mm256_cvtpd_ps(_mm256_loadu_pd(values + 4)), _mm256_cvtpd_ps(_mm256_loadu_pd(values)));
 }
 
-// Converts as many pixels as make up whole groups of eight, and returns their number. The rest is left to toLevels().
-// This rounds in float: the value is off by half an ulp, and so is the product, together by 255 * 2^-25 + 2^-17 <
-// 2^-16. If that is near enough to a tie to matter, or a colour is within 2 floats of an sRGB threshold, all eight
-// pixels go through toLevels(). `farthest` is no less than that of toLevels(), and a tie for the same pixels. If it is
-// no tie, it may be up to 2^-15 larger.
+// Converts whole groups of eight pixels, and returns the number of pixels; the rest is for toLevels(). This rounds in
+// float: the value is off by half an ulp, and so is the product, together by 255 * 2^-25 + 2^-17 < 2^-16. If that could
+// matter because a tie is near, or if a colour is within 2 floats of an sRGB threshold, all eight pixels go through
+// toLevels(). `farthest` is at least that of toLevels(), and is a tie for the same pixels. Otherwise it may be up to
+// 2^-15 larger.
 template <bool IsSrgb, class Real>
 DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out, double& farthest) noexcept
 {
@@ -344,9 +343,9 @@ inline __m128 pixelOf(const double* rgba) noexcept
 inline __m128 pixelOf(const float* rgba) noexcept { return _mm_add_ps(_mm_loadu_ps(rgba), _mm_setzero_ps()); }
 #endif
 
-// Stores float pixels past the cache, in whole cache lines: this thread does not read `out` soon, so its lines need not
-// be fetched. Call storesAreDone() before other threads learn of the pixels. Returns how many pixels were stored, from
-// the first on. The caller must store the others.
+// Stores float pixels without going through the cache, in whole cache lines, as this thread does not read `out` soon.
+// Call storesAreDone() before other threads learn of the pixels. Returns how many pixels were stored, from the first
+// on. The caller must store the others.
 template <class Real>
 int streamPixels([[maybe_unused]] const Real* rgba, [[maybe_unused]] int count, [[maybe_unused]] float* out) noexcept
 {
@@ -371,15 +370,15 @@ inline void storesAreDone() noexcept
 #endif
 }
 
-// Dither: conversion to 8 bits that leaves no bands in gradients. Each pixel's place in the image gives a threshold. A
-// value that is farther than this fraction of the way between two levels takes the upper one. So the mean over
-// neighbours can lie between levels.
+// Dither: conversion to 8 bits without bands in gradients. Each pixel's place in the image gives a threshold in [0, 1].
+// A value farther than this fraction of the way between two levels takes the upper one. So the mean over neighbours can
+// lie between levels.
 //
 // The thresholds are those of B. E. Bayer, "An optimum method for two-level rendition of continuous-tone pictures",
 // IEEE Intl. Conf. on Communications 1973: each of (rank + 1/2) / 64, for ranks 0 to 63, occurs once in any 8x8 pixels.
-// Unlike noise, they keep the mean over every such block, and need only integers. Colours are rounded to float first:
-// then each step is exact, and an image of floats gets the same levels. All channels of a pixel have one threshold, so
-// grey stays grey, and a darker channel does not come out lighter than a brighter one.
+// Unlike noise, they keep the mean over every such block, and need only integers. Colours are rounded to float first,
+// so that each step is exact, and an image of floats gets the same levels. All channels of a pixel have one threshold:
+// grey stays grey, and a darker channel does not become lighter than a brighter one.
 
 // Returns 0 to 63: the bits of x ^ y and of y in turn, the lowest bits of x and y becoming the highest.
 constexpr int ditherRank(int x, int y) noexcept
@@ -404,8 +403,8 @@ inline int ditherUnorm8(float value, double threshold) noexcept
 }
 
 // The sRGB level at or below `value`, or the next one if `value` is more than the fraction `threshold` of the way to
-// it. The fraction is measured in linear light, so that the mean is right for an eye that sees no single pixels.
-// Measured in levels, it differs by less than 1/128.
+// it. The fraction is measured in linear light, in which an eye that sees no single pixels averages them. In levels it
+// differs by less than 1/128.
 inline int ditherSrgb8(float value, double threshold)
 {
     static const std::array<double, 256> light = [] {

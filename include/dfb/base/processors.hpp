@@ -20,8 +20,8 @@ class Processors {
 public:
     static constexpr int limit = 1024;
 
-    // The CPU mask of the calling thread, which the threads that it starts inherit. If the mask cannot be queried, this
-    // is the set of all processors of the machine. Never empty.
+    // The CPU mask of the calling thread, which threads that it starts inherit. If the mask cannot be queried, it is
+    // all processors of the machine. Never empty.
     static Processors ofThisThread() noexcept
     {
         Processors found;

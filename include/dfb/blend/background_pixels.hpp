@@ -1,5 +1,4 @@
-// BackgroundPixels: which pixels of a tile already hold the background in the image's memory, so that they need not be
-// written again.
+// BackgroundPixels: which pixels of a tile already show the background in the image, and need not be written again.
 #pragma once
 
 #include <dfb/base/cpu.hpp>

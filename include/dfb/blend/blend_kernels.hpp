@@ -1,9 +1,9 @@
 // The kernels of blending: layers under pixels, in double, and two layers of 8-bit levels, in integers. Each kernel
-// exists in plain C++ and, for processors that have it, for AVX2, mostly by hand. Both give the same bits, as they
-// compute the same products and sums and round each of them.
+// exists in plain C++ and for AVX2, mostly written by hand. Both give the same bits, as they round the same products
+// and sums.
 //
-// A pixel that is opaque already is blended like the others, unless its whole block is opaque: then the layers behind
-// are left out. That is checked after the first layer and then after every fourth. So an infinity or a NaN of a layer
+// If a whole block of pixels is opaque, the layers behind are left out. This is checked after the first layer and then
+// after every fourth. Opaque pixels of other blocks are blended like the rest. So an infinity or a NaN of a layer
 // behind may or may not show in an opaque pixel. A finite value never does.
 #pragma once
 
@@ -21,8 +21,8 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// Layers to be composited together under a run of pixels, front to back. A group has few layers, as a processor follows
-// few streams of memory at a time. Each group is read for the whole run before the next one.
+// Layers to be composited together under a run of pixels, front to back. A group has few layers, as a processor reads
+// only few streams of memory well. Each group is read for the whole run before the next one.
 struct BlendGroup {
     static constexpr int mostLayers = 8;
 
@@ -32,8 +32,7 @@ struct BlendGroup {
     double minTransmittance = 0; // a pixel that lets less through counts as opaque
 };
 
-// When k of `layers` layers are blended: up to which layer to go on before it is checked again whether the pixels are
-// opaque.
+// When k of `layers` layers are blended: the layer at which to check again whether the pixels are opaque.
 constexpr int nextLook(int k, int layers) noexcept { return std::min(layers, k == 0 ? 1 : k + 4); }
 
 // ---- plain
@@ -74,7 +73,7 @@ inline bool isOpaque(const double* transmittance, int count)
 }
 
 // Composites layers under `count` pixels, which are a block. colorOf(k, p) is the colour of the k-th layer at pixel p.
-// Returns false if all pixels are opaque, so that nothing behind them can be seen; so do the functions below.
+// Returns false if all pixels are opaque, so that nothing behind them can be seen, as do the functions below.
 template <bool HasLeast, class ColorOf>
 bool blendBlock(double* rgba, double* transmittance, int count, bool isFirst, int layers, double minTransmittance,
                 const ColorOf& colorOf)
@@ -237,8 +236,8 @@ struct Avx2Pixel {
 struct Avx2Colors {
     __m128 a, b, c, d;
 
-    // Loads four neighbouring pixels. Also prefetches the pixels 64 further on, which are the next row in a full tile
-    // 64 pixels wide: no processor predicts streams that jump from layer to layer.
+    // Loads four neighbouring pixels. Also prefetches the pixels 64 further on, the next row of a full tile 64 pixels
+    // wide: processors do not predict reads that jump from layer to layer.
     DFB_AVX2 DFB_INLINE void load(const float* color)
     {
         _mm_prefetch(reinterpret_cast<const char*>(color + 256), _MM_HINT_T0);

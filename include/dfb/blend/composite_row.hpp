@@ -62,8 +62,8 @@ struct CompositeRow {
     // not computed.
     std::vector<double> rgbaLow, transmittanceLow;
     AuxPixels aux;
-    // For layers that have a far depth: how far back those with alpha > 0 reach so far, and whether any layer began
-    // before the reach of one in front of it.
+    // For layers that have a far depth: how far back those with alpha > 0 reach so far, and whether any layer overlaps
+    // one in front of it.
     std::vector<float> reach;              // width, or empty
     std::vector<std::uint8_t> isUndefined; // width, or empty
     double minTransmittance = 0;           // a pixel that lets less through counts as opaque

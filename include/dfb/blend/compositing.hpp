@@ -1,13 +1,13 @@
-// Compositing: the pure functions on spans of pixels from which tile operations are made: `over`, sort-and-blend and
-// nearest, all accumulated in double.
+// Compositing: pure functions on spans of pixels, for tile operations: over, sort-and-blend and nearest, all
+// accumulated in double.
 //
-// All operations use one fold, so that the image does not depend on arrival order, threads or ranks. Per pixel, layers
-// are blended front to back in (depth, position in the list of layers): colour and alpha accumulate as `A += T * a`,
-// and the transmittance T is a variable of its own, updated by `T *= 1 - a`. If colour and alpha are finite floats,
-// alpha is in [0, 1], colour is non-negative, and there are up to 65536 layers, the accumulated double is within 2^-36
-// (relative) of the exact sum, so rounding it to float is within 1 ulp of exact. Where that is not enough to tell which
-// of two 8-bit levels is nearer, the row is composited again in twice the precision. Pixels are premultiplied: colour
-// is added as it stands, also where alpha is 0.
+// All operations blend alike, so that the image does not depend on arrival order, threads or ranks. In each pixel
+// layers are blended front to back in (depth, position in the list of layers): colour and alpha accumulate as `A += T *
+// a`. The transmittance T is a variable of its own, updated by `T *= 1 - a`. Accuracy, for finite floats, alpha in [0,
+// 1], non-negative colour and up to 65536 layers: the accumulated double has a relative error of at most 2^-36, so
+// rounding it to float is within 1 ulp of exact. Where that does not tell which of two 8-bit levels is nearer, the row
+// is composited again in twice the precision. Pixels are premultiplied: colour is added as it stands, also where alpha
+// is 0.
 #pragma once
 
 #include <dfb/blend/blend_kernels.hpp>
@@ -58,7 +58,7 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
         detail::takeNearestPlain(row.depth.data() + x, count, layer.color, layer.depth); // often one pixel
 }
 
-// Makes those pixels in [x, x + count) opaque that count as opaque: their transmittance is below minTransmittance.
+// Sets the transmittance of pixels in [x, x + count) to 0 where it is below minTransmittance: they count as opaque.
 inline void closeOpaque(CompositeRow& row, int x, int count)
 {
     double* t = row.transmittance.data() + x;
@@ -209,8 +209,8 @@ inline int firstOutOfOrder(const std::vector<Layer>& layers, const std::vector<i
 inline void sortAt(int pixel, const std::vector<Layer>& layers, std::vector<int>& order)
 {
     const auto depthOf = [&](int layer) { return layers[static_cast<std::size_t>(layer)].depth[pixel]; };
-    // Insertion sort, as the order of the last pixel is nearly always nearly right. If that takes too many moves,
-    // std::sort() takes over.
+    // Insertion sort, as the order of the last pixel usually needs few changes. After too many moves std::sort() takes
+    // over.
     std::size_t movesLeft = 8 * order.size();
     for (std::size_t i = 1; i < order.size(); ++i) {
         if (movesLeft < i) {
@@ -303,7 +303,7 @@ inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<
 // Sorts and blends: composites `count` pixels of several layers into `row` at [x, x + count), each pixel front to back
 // by (depth, index in `layers`). No depth may be NaN (the wire replaces NaN by +infinity). If any layer has no depth,
 // all depths count as equal. `order` is scratch space, either empty or as the last call left it: sorting starts from
-// that order, and is faster the better it fits.
+// that order, and is fast if it fits.
 inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
     if (layers.size() == 1 || !detail::haveDepths(layers)) {
@@ -333,9 +333,8 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
     }
 }
 
-// For each of `count` pixels, keeps the nearest layer, by (depth, index in `layers`), and puts it into `row` at
-// [x, x + count). This is for opaque inputs. Pixels with alpha 0 count as well, also for depth, position and ids, as
-// something is there.
+// For each of `count` pixels, keeps the nearest layer, by (depth, index in `layers`), and puts it into `row` at [x, x +
+// count). For opaque inputs. Pixels with alpha 0 count, too, also for depth, position and ids.
 inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
 {
     const auto isPlain = [](const Layer& layer) { return layer.depth && !layer.aux; };

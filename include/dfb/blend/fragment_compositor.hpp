@@ -17,12 +17,12 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Composites the fragments of one tile and pass, row by row. Where depths are equal, the fragments' order decides: sort
-// them by (source, part) first.
+// Composites the fragments of one tile and pass, row by row. Of equal depths the first fragment is in front: sort them
+// by (source, part) first. One thread at a time may use it.
 class FragmentCompositor {
 public:
-    // `begin` to `end` are iterators of pointers to fragments, which must outlive this. `isFirst`: nobody else has
-    // walked the fragments yet, so this walk counts the faults of pixels.
+    // `begin` to `end` are iterators of pointers to fragments, which must outlive this. `isFirst`: this is the first
+    // walk of the fragments, so it counts the faults of pixels.
     template <class Iterator>
     void start(BlendRule rule, Iterator begin, Iterator end, bool isFirst = true)
     {
@@ -235,8 +235,7 @@ private:
             detail::resetOrder(order_, layers_.size());
         if (isTold || detail::firstOutOfOrder(layers_, order_, 0, count) == count)
             return true;
-        // Sorts copies: another process may change a depth meanwhile, or a depth may be NaN, and no sort can cope with
-        // that.
+        // Sorts copies: no sort can cope with a NaN, or with a depth that another process changes meanwhile.
         float depths[detail::mostInPlace];
         firsts_.resize(layers_.size());
         for (std::size_t k = 0; k < firsts_.size(); ++k) {
@@ -264,8 +263,8 @@ private:
         clearGap(row, end, static_cast<int>(row.transmittance.size()));
     }
 
-    // For fragments in order: blends one after the other, each under what is there. That begins one run per span, where
-    // compositeRuns() begins one at every edge of a span.
+    // For fragments in order: blends one fragment after the other, each under those before. This begins a run for each
+    // span; compositeRuns() begins one at every edge of a span.
     void compositeLayers(CompositeRow& row)
     {
         const int width = static_cast<int>(row.transmittance.size());
@@ -361,7 +360,7 @@ private:
         joinRun(x, count);
     }
 
-    // Adds pixels of the row to runs(): to the last run, if the gap is narrow.
+    // Adds pixels of the row to runs(): to the last run if the gap before them is narrow.
     void joinRun(int x, int count)
     {
         if (!runs_.empty() && !runs_.back().color && x - (runs_.back().x + runs_.back().count) < narrowGap)

@@ -1,6 +1,6 @@
-// The kernels for rows in place: if all inputs of a tile have the same bounds, they are blended as they are read. They
-// exist for AVX2 alone, and that for full rows for AVX-512. Without AVX2, such rows are searched, copied and blended
-// like others, with the same bits as the result.
+// The kernels for rows in place: if all inputs of a tile have the same bounds, they are blended as they are read. All
+// exist for AVX2; that for full rows also for AVX-512. Without AVX2 such rows are searched, copied and blended like
+// others, with the same bits as the result.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -76,8 +76,8 @@ DFB_AVX2 bool blendFullRowsAvx2(const RowInPlace* rows, int layers, double minTr
     return !hasGap && check.isGood();
 }
 
-// Two pixels in a register, and the transmittance of each, four times, in another. Instructions that zero what a mask
-// leaves out are used, although it leaves out nothing: of the others GCC 12 says that they read what is uninitialized.
+// Two pixels in a register, and the transmittance of each, four times, in another. The instructions have a mask that
+// leaves out nothing: for those without a mask GCC 12 warns of uninitialized values.
 template <bool HasLeast>
 struct Avx512Pair {
     __m512d sum, through;
@@ -188,7 +188,7 @@ DFB_AVX2 std::uint64_t blendSparseRowsAvx2(const RowInPlace* rows, int layers, i
     return active;
 }
 
-// Four pixels of each row that has anything in them, to be sorted.
+// Four pixels of each row that is active there, to be sorted.
 struct SparseFour {
     alignas(16) float colors[mostInPlace][16];
     alignas(16) float depths[mostInPlace][4];
@@ -235,7 +235,7 @@ struct SparseFour {
 
 // As blendSparseRowsAvx2(), but each pixel's layers are sorted by (depth, row). Also sets `isGood` to false if a depth
 // is NaN where the row has anything in the four pixels. AtOnce: how many fours are read, rowsAtOnce rows at a time,
-// before they are blended; 1, which is faster for few rows: all rows at a time.
+// before they are blended. 1: all rows at a time, which is faster for few rows.
 template <bool HasLeast, int AtOnce>
 DFB_AVX2 std::uint64_t sortSparseRowsAvx2(const RowInPlace* rows, int layers, int begin, double minTransmittance,
                                           double* rgba, double* transmittance, bool& isGood)

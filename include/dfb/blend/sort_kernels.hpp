@@ -94,9 +94,9 @@ inline int firstOutOfOrder(const OrderedDepths& order, int begin, int end)
 
 // ---- sorting four pixels at once
 
-// Batcher's odd-even merge sort (1968): the pairs of places to compare and exchange, one after the other, whatever
-// their contents. It is the network for the next power of 2, without the places beyond the layers: those would hold the
-// largest values already.
+// Batcher's odd-even merge sort (1968): the pairs of places to compare and exchange, in this order, whatever their
+// values. It is the network for the next power of 2 without the places beyond the layers, which would hold the largest
+// values.
 class SortNetwork {
 public:
     static constexpr int mostLayers = 128;
@@ -136,9 +136,9 @@ private:
 using FourOrders = std::uint32_t[SortNetwork::mostLayers][4];
 
 // Sorting moves one number for each layer: its depth as a double, whose last 29 bits are 0, with the layer's index in
-// the last bits. That orders by depth, then index. A negative number is less the more bits are set, so there the index
-// is complemented. Infinities are replaced by finite numbers, as an infinity with more bits would be a NaN. Both zeros
-// become one number, which is less than all floats above 0. A NaN counts as +infinity.
+// the last bits. That orders by depth, then index. In a negative number the index is complemented, as more bits make it
+// less. Infinities are replaced by finite numbers, as an infinity with more bits would be a NaN. Both zeros become one
+// number, which is less than all floats above 0. A NaN counts as +infinity.
 constexpr double infinityKey = 0x1p200, zeroKey = 0x1p-200;
 constexpr std::int64_t layerBits = SortNetwork::mostLayers - 1;
 

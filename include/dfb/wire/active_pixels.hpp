@@ -27,8 +27,8 @@ struct Span {
 namespace detail {
 
 // The row to prefetch while row y is read. For the last rows before `yEnd` it is y itself. Prefetching 4 KiB of colours
-// ahead was fastest where it was measured. Prefetch the row in pieces, between the work on row y: all at once takes up
-// to a quarter longer.
+// ahead was measured to be fastest. Prefetch the row in pieces, between the work on row y: all at once takes up to a
+// quarter longer.
 inline int rowAhead(int y, int yEnd, int width)
 {
     const int ahead = y + (width < 64 ? 1 : std::max(1, 256 / width));
@@ -185,8 +185,8 @@ struct RowPixels {
     bool isFull = false;             // all pixels that could be active are
 };
 
-// The pixels of an input that are read where they lie. Another process may write to them at any time: each value is
-// checked as it is copied, so that a program that breaks its promise spoils its own picture and nothing else.
+// The pixels of an input that are read where they lie. Another process may write to them at any time. Each value is
+// checked as it is copied, so a program that breaks its promise spoils only its own picture.
 struct PixelsInPlace {
     const std::byte* color = nullptr; // of the first pixel of the tile's region
     const float* depth = nullptr;     // null: not wanted

@@ -59,9 +59,9 @@ inline std::size_t largestFragment(int width, int height, ChannelMask channels)
     return mostBytes(width, height, PlaneFormat(channels, sizeof(float)).pixelBytes());
 }
 
-// Copies values of 3 floats a pixel, premultiplied by alpha, and changes them to be premultiplied by the rounded alpha
-// that the owner gets. The owner divides by the rounded alpha in the end, so with the original alpha the result would
-// not be a mean. `encoded`: the colours `rgba`, as they travel.
+// Copies values of 3 floats a pixel, premultiplied by alpha, and premultiplies them by the rounded alpha instead. The
+// owner gets the rounded alpha and divides by it in the end, so otherwise the result would not be a mean. `encoded`:
+// the colours `rgba`, as they travel.
 inline void multiplyByRounded(const WireCoder& coder, WireFormat format, const float* rgba, const std::byte* encoded,
                               const float* in, std::size_t pixels, float* out)
 {
@@ -151,7 +151,7 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     const std::size_t payload = format.bodyBytes(h.shape), size = fragmentPrefix + payload;
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
 
-    // Moves a message that does not fit its block, or fills less than three quarters of it: the block is soon needed
+    // Moves a message that does not fit its block, or fills less than three quarters of it: this block is soon needed
     // again.
     if (4 * size < 3 * message.size() || message.size() < size) {
         Buffer smaller = pool.acquire(size);
@@ -249,7 +249,7 @@ Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, ChannelMask chan
 // not in it.
 using SharedBytes = FunctionRef<const std::byte*(std::int64_t offset, std::int64_t byteCount)>;
 
-// Whether a fragment message claims to be read in place. Nothing in the message need have been checked.
+// Whether a fragment message says that its pixels are read in place. The message need not have been checked.
 inline bool saysInPlace(const Buffer& message)
 {
     return message.size() >= fragmentPrefix

@@ -62,10 +62,10 @@ struct SparseShape {
 };
 static_assert(sizeof(SparseShape) == 12 && std::is_trivially_copyable_v<SparseShape>);
 
-// Makes a plane of pixels, of `words` words each, easier to compress. Neighbouring pixels are alike in the upper bits
-// of each word and rarely in the lower ones. Each word becomes its difference to the word of the pixel before, coded so
+// Makes a plane of pixels, of `words` words each, easier to compress. Neighbouring pixels often have equal upper bits
+// in each word, and rarely equal lower ones. Each word becomes its difference to the word of the pixel before, coded so
 // that small differences of either sign have zeros at the top. Then all first bytes are stored, then all second bytes,
-// and so on. Without this, a codec that looks for repetitions finds few in the bytes of floats.
+// and so on. So a codec that looks for repetitions finds more of them.
 //
 // Works on blocks of pixels, with loops that compilers vectorize.
 template <class Word, std::size_t words>
@@ -280,16 +280,15 @@ inline PixelsInPlace pixelsInPlace(const InputPixels& tile, ChannelMask channels
     return p;
 }
 
-// The active pixels of an input. Keep one per thread, and use it again and again. A pixel of colour 0 and alpha 0
-// contributes nothing, whatever its depth. A pixel with a colour but alpha 0 is emission and contributes. By depth, a
-// pixel contributes if its depth is below InputPixels::depthLimit, and only then.
+// The active pixels of an input. Keep one per thread, and reuse it. A pixel of colour 0 and alpha 0 contributes
+// nothing, whatever its depth. A pixel with a colour but alpha 0 is emission and contributes. By depth, a pixel
+// contributes only if its depth is below InputPixels::depthLimit.
 class ActivePixels : public ActiveSpans {
 public:
     // `channels` must have colour, and depth if `byDepth`; the tile must have all of them. Copies the active pixels in
     // the form in which they travel: colours to `colors`, which has room for all pixels of the tile, depths to
     // `depths`, if that is not null, and the rest to memory of its own. Returns where they are. Each row is copied as
-    // soon as its spans are found, so that it is read from memory only once: rows of a large image are far apart.
-    // Adds to `faults`.
+    // soon as its spans are found, so that it is read from memory only once. Adds to `faults`.
     ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, std::byte* colors, float* depths,
                        InputFaults& faults)
     {

@@ -1,5 +1,5 @@
-// How colour travels: as float32, or as codes of 16 or 8 bits; what that costs in accuracy, and the choice of the
-// cheapest format that keeps an error budget.
+// The formats in which colour travels: float32, or codes of 16 or 8 bits; the bound of their errors; and the choice of
+// the cheapest format within an error budget.
 #pragma once
 
 #include <dfb/compiled.hpp>
@@ -12,9 +12,9 @@
 DFB_NAMESPACE_BEGIN
 
 // Only colour and alpha are rounded, and the bound is for these. All other channels travel unchanged. Depth, positions
-// and ids of the image are bit for bit what they would be with Float32: a pixel whose alpha was above 0 counts for them
-// even if its alpha was rounded to 0. Normals and albedo are means of the inputs' unrounded values, weighted by their
-// rounded alphas, so the mean is off by as much as the weights.
+// and ids of the image are bit for bit those with Float32: a pixel whose alpha was above 0 counts even if its alpha was
+// rounded to 0. Normals and albedo are means of the inputs' unrounded values, weighted by their rounded alphas: only
+// the weights are off.
 //
 // The bound. A pixel is `C = sum_j T_j c_j`, with T_j the product of 1 - a_i over the layers i in front of j. The last
 // layer is the background. After rounding, layer j has c_j + d_j and a_j + e_j. Replace the layers by the rounded ones,
@@ -29,8 +29,8 @@ DFB_NAMESPACE_BEGIN
 //   Float16:         |d| <= u c, |e| <= u a, u = 2^-11, and sum_j T'_j a'_j <= 1: u / (1 - u) (M + B), however many
 //                    layers there are. Values below 2^-28 M are denormal there: 2^-39 (M + B) more for each layer.
 // A mean of passes is no worse than its worst pass. Unorm is converted in float, with four roundings of 2^-24 M, which
-// adds 2^-21 (M + B) for each layer. And `c <= M a` is checked in float, which multiplies all that by 1 + 2^-20.
-// tests/unit/wire/wire_format.cpp looks for pixels that are worse, also at the edges.
+// adds 2^-21 (M + B) for each layer. `c <= M a` is checked in float, which multiplies all this by 1 + 2^-20.
+// tests/unit/wire/wire_format.cpp searches for pixels with a larger error.
 
 enum class WireFormat : std::uint8_t {
     Float32, // as the renderer wrote it
@@ -48,10 +48,9 @@ struct ErrorBudget {
 };
 
 // For 8-bit images: a value may be off by half a level before the final rounding, so by at most one level after it. A
-// pixel operation may make more of it.
-// Only inputs that go to another node (to a rank that shares no memory with this one) are rounded, to the cheapest
-// format that keeps this bound. Everything else is exact, and so are float images. The image may therefore depend on
-// which ranks share a node.
+// pixel operation may enlarge this error. Only inputs that go to another node (to a rank that shares no memory with
+// this one) are rounded, to the cheapest format that keeps this bound. Everything else is exact, and so are float
+// images. The image may therefore depend on which ranks share a node.
 struct HalfLevel {
     float maxColor = 1; // see Precision
 };
@@ -61,8 +60,8 @@ struct HalfLevel {
 struct Precision {
     Precision() = default;
     Precision(WireFormat colorFormat) : color(colorFormat) {} // NOLINT: meant to convert
-    // The format of the colour is chosen anew for each frame: the cheapest that is sure to keep within the budget,
-    // given FrameConfig::maxLayers. If there is none, it is Float32.
+    // Each frame takes the cheapest format whose error is within the budget for FrameConfig::maxLayers layers; if there
+    // is none, Float32.
     Precision(const ErrorBudget& errorBudget) // NOLINT: meant to convert
         : budget(errorBudget.error), maxColor(errorBudget.maxColor)
     {
@@ -75,8 +74,8 @@ struct Precision {
     WireFormat color = WireFormat::Float32; // of colour and alpha
     double budget = 0;                      // above 0: replaces `color`
     bool isHalfLevel = false;               // replaces both
-    // The largest colour that occurs, as a renderer would give it before it multiplies by alpha: each channel is within
-    // [0, maxColor * alpha]. A tile with other pixels, such as emission or HDR, travels as Float32.
+    // The largest colour, before it is multiplied by alpha: each channel is within [0, maxColor * alpha]. A tile with
+    // other pixels, such as emission or HDR, travels as Float32.
     float maxColor = 1;
 };
 
@@ -111,9 +110,9 @@ public:
     // Encodes `count` pixels, which are in range, in a format that rounds. `out` gets 4 * bytesOf(format) bytes for
     // each.
     void encodeColor(WireFormat format, const float* rgba, int count, std::byte* out) const;
-    // Decodes `count` pixels, which are not Float32. An alpha that was rounded to 0 becomes leastAlpha. It is known to
-    // have been above 0: a pixel of alpha 0 that is in range has no colour, and does not travel. With activeByDepth it
-    // does travel, and an alpha of 0 stays 0. Returns false if there is a code that encodeColor() does not make.
+    // Decodes `count` pixels, which are not Float32. An alpha that was rounded to 0 becomes leastAlpha. It was above 0:
+    // a pixel in range with alpha 0 has no colour, and does not travel. With activeByDepth it does travel, and an alpha
+    // of 0 stays 0. Returns false if there is a code that encodeColor() does not make.
     bool decodeColor(WireFormat format, const std::byte* in, std::size_t count, float* rgba) const;
 
     // Above 0, less than the least alpha that has a code of its own, and negligible beside the error bound.
@@ -144,8 +143,8 @@ inline double wireErrorBound(WireFormat format, std::int64_t layers, double maxC
     return 0;
 }
 
-// The cheapest format whose bound is within `budget`; of two that cost the same, the one with the smaller bound. If
-// `layers` is 0, it is not known, and 65536 is assumed.
+// The cheapest format whose bound is within `budget`; of two that cost the same, the one with the smaller bound.
+// `layers` 0: not known, counts as 65536.
 inline WireFormat cheapestWithin(double budget, std::int64_t layers, double maxColor, double background)
 {
     const auto boundOf = [&](WireFormat format) {

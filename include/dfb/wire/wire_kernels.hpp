@@ -38,8 +38,8 @@ inline std::uint32_t bitsOf(float value) noexcept
 // Converts a number from 0 to 65504 to the nearest binary16, ties to even.
 inline std::uint16_t positiveToHalf(float value) noexcept
 {
-    // `small` is the result where it is denormal: adding 0.5 rounds the value, and leaves the bits that stay at the end
-    // of the mantissa.
+    // `small` is the result where it is denormal: adding 0.5 rounds the value, and moves its bits to the end of the
+    // mantissa.
     const std::uint32_t bits = bitsOf(value), small = bitsOf(value + 0.5f) - 0x3f000000u;
     const std::uint32_t normal = (bits + 0xc8000fffu + (bits >> 13 & 1u)) >> 13;
     // A mask, as compilers do not vectorize a choice between values made of floats.
@@ -59,7 +59,7 @@ template <class Unsigned>
 struct UnormCode {
     using Word = Unsigned;
     static constexpr Word most = std::numeric_limits<Word>::max();
-    // The addition leaves no bit below one: it rounds to an integer, ties to even, which is in the lowest bits.
+    // The addition rounds to an integer, ties to even, which is then in the lowest bits.
     static Word of(float value) noexcept { return static_cast<Word>(bitsOf(value + 0x1p23f)); }
     static float valueOf(Word code) noexcept { return static_cast<float>(code); }
 };

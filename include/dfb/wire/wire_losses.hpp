@@ -1,5 +1,5 @@
 // WireLosses: bounds how far the pixels of a tile may be off because inputs were rounded for sending, or because layers
-// behind nearly opaque ones were left out. It is the bound of wire_format.hpp for the inputs that have really come.
+// behind nearly opaque ones were left out. This is the bound of wire_format.hpp for the inputs that have come.
 #pragma once
 
 #include <dfb/fragment.hpp>
