@@ -9,9 +9,11 @@
 
 #include <algorithm>
 #include <array>
+#include <cerrno>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
+#include <cstring>
 #include <new>
 #include <numeric>
 #include <string>
@@ -256,6 +258,7 @@ DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image)
     const auto width = static_cast<std::size_t>(image.width()), height = static_cast<std::size_t>(image.height());
     const bool isFloat = image.format() == OutputFormat::RGBA32F;
     std::vector<std::uint8_t> converted(isFloat ? 4 * width : 0), row(3 * width);
+    errno = 0;
     std::FILE* file = std::fopen(path.c_str(), "wb");
     bool good = file && std::fprintf(file, "P6 %zu %zu 255\n", width, height) > 0;
     for (std::size_t y = 0; good && y < height; ++y) {
@@ -270,7 +273,7 @@ DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image)
     if (file && std::fclose(file) != 0)
         good = false;
     if (!good)
-        detail::failArgument("cannot write %s", path.c_str());
+        detail::failArgument("cannot write %s: %s", path.c_str(), std::strerror(errno));
 }
 
 DFB_NAMESPACE_END

@@ -9,10 +9,12 @@
 
 #include <algorithm>
 #include <array>
+#include <cerrno>
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
+#include <cstring>
 #include <exception>
 #include <fstream>
 #include <locale>
@@ -280,8 +282,9 @@ public:
             if (fb.rank() == 0)
                 parts.push_back(std::move(one[static_cast<std::size_t>(rank)]));
         }
-        std::vector<std::byte> failed;
+        std::string reason; // why rank 0 could not write it
         if (fb.rank() == 0) {
+            errno = 0;
             std::ofstream file(path);
             file.imbue(std::locale::classic());
             try {
@@ -291,12 +294,14 @@ public:
                 file.setstate(std::ios::badbit);
             }
             if (!file)
-                failed.emplace_back();
+                reason = std::strerror(errno);
         }
-        const bool isWritten = fb.allGather(failed).front().empty();
+        const auto* text = reinterpret_cast<const std::byte*>(reason.data());
+        const std::vector<std::byte> heard = fb.allGather({text, text + reason.size()}).front();
         take(); // those of this call
-        if (!isWritten)
-            detail::failArgument("%s: cannot be written", path.c_str());
+        if (!heard.empty())
+            detail::failArgument("%s: cannot be written: %.*s", path.c_str(), static_cast<int>(heard.size()),
+                                 reinterpret_cast<const char*>(heard.data()));
     }
 
 private:

@@ -146,6 +146,8 @@ TEST_CASE("writePpm writes what a viewer shows, and says what it cannot write", 
     CHECK_THROWS_AS(dfb::writePpm(path, dfb::Image()), dfb::InvalidArgument);
     dfb::Image image(*pool, 1, 1, dfb::OutputFormat::RGBA8, 0);
     CHECK_THROWS_AS(dfb::writePpm("no_such_folder/" + path, image), dfb::InvalidArgument);
+    CHECK_THROWS_WITH(dfb::writePpm("no_such_folder/a.ppm", image),
+                      "dfb: invalid argument: cannot write no_such_folder/a.ppm: No such file or directory");
     std::remove(path.c_str());
 }
 

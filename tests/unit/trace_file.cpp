@@ -117,11 +117,14 @@ TEST_CASE("A trace file says how many events of all ranks are missing", "[trace]
     CHECK(written.missing == 3 + 7);
 }
 
-TEST_CASE("A trace file that cannot be written is an error", "[trace]")
+TEST_CASE("A trace file that cannot be written is an error that says why", "[trace]")
 {
     dfb::TraceFile trace(1);
     LoneRank rank;
     CHECK_THROWS_AS(trace.write(rank, "no such folder/trace.json"), dfb::InvalidArgument);
+    CHECK_THROWS_WITH(trace.write(rank, "no such folder/trace.json"),
+                      "dfb: invalid argument: no such folder/trace.json: cannot be written: No such file or "
+                      "directory");
 }
 
 // Groups digits, as the locale of a program with windows may do.
