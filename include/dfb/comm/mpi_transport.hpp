@@ -671,17 +671,22 @@ private:
         }
     }
 
-    // Leaves to MPI the requests that cannot be cancelled, with their buffers, which it may still use. Leaves it the
+    // Leaves to MPI the buffers of requests that cannot be cancelled, which it may still use. Leaves it the
     // communicator, too, because freeing that is collective.
     void abandon()
     {
-        int done = 0;
-        if (!detail::mpiSays(MPI_Finalized))
-            for (auto* requests : {&packets_.requests, &receives_.requests})
-                for (MPI_Request& request : *requests)
-                    if (request != MPI_REQUEST_NULL && MPI_Cancel(&request) == MPI_SUCCESS)
-                        MPI_Test(&request, &done, MPI_STATUS_IGNORE);
-        new std::array<Transfers, 4>{std::move(sends_), std::move(receives_), std::move(notices_), std::move(packets_)};
+        const bool isOver = detail::mpiSays(MPI_Finalized);
+        for (Transfers* all : {&packets_, &receives_, &sends_, &notices_})
+            for (std::size_t i = 0; i < all->requests.size(); ++i) {
+                MPI_Request& request = all->requests[i];
+                int done = 0;
+                if (!isOver && request != MPI_REQUEST_NULL && (all == &packets_ || all == &receives_))
+                    MPI_Cancel(&request);
+                if (!isOver && request != MPI_REQUEST_NULL)
+                    MPI_Test(&request, &done, MPI_STATUS_IGNORE);
+                if (request != MPI_REQUEST_NULL)
+                    new Transfer(std::move(all->items[i]));
+            }
         ranks_.abandon();
     }
 

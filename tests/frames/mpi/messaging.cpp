@@ -452,6 +452,25 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
     CHECK(goodFrame(fb, s));
 }
 
+TEST_CASE("A transport that is left behind keeps no memory", "[messaging]")
+{
+    struct Inbox : dfb::TransportHandler {
+        void receive(int, dfb::Buffer&&) override {}
+        void fail(const dfb::ErrorInfo&) override {}
+        bool failed() const override { return false; }
+    } inbox;
+    std::weak_ptr<dfb::MemoryPool> memory;
+    {
+        const auto pool = dfb::MemoryPool::create();
+        memory = pool;
+        dfb::MpiTransport transport(MPI_COMM_WORLD, pool, dfb::Progress::Caller);
+        transport.start(inbox);
+        transport.stop(false); // as if an exception were passing
+    }
+    CHECK(memory.expired());
+    MPI_Barrier(MPI_COMM_WORLD);
+}
+
 // Takes 3 GiB of memory on the first and the last rank.
 TEST_CASE("A message of more than 2 GiB comes whole", "[messaging][.stress]")
 {
