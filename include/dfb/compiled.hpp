@@ -34,7 +34,7 @@
 // variable as thread_local. dfb::compiled has it as an ordinary one, to which the files that use it point. So the
 // linker refuses a mixture. The variable is hidden: a library that uses dfb::compiled may be linked with one that does
 // not.
-#if defined(__GNUC__) && defined(__ELF__)
+#if defined(__ELF__)
 extern "C" {
 #if defined(DFB_COMPILING)
 __attribute__((visibility("hidden"))) int dfb_either_all_files_with_dfb_compiled_or_none = 0;

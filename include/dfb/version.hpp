@@ -27,11 +27,15 @@
 #endif
 #endif
 
-#if (defined(_MSVC_LANG) ? _MSVC_LANG : __cplusplus) < 201703L
+#if !defined(__GNUC__) // defined by Clang as well
+#error "dfb needs GCC or Clang"
+#endif
+
+#if __cplusplus < 201703L
 #error "dfb needs C++17: compile with -std=c++17"
 #endif
 
-#if (defined(__GNUC__) && !defined(__EXCEPTIONS)) || (defined(__GNUC__) && !defined(__GXX_RTTI))
+#if !defined(__EXCEPTIONS) || !defined(__GXX_RTTI)
 #error "dfb needs exceptions and RTTI: compile without -fno-exceptions and -fno-rtti"
 #endif
 

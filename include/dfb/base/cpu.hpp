@@ -14,7 +14,8 @@
 #include <cstddef>
 #include <cstdint>
 
-#if (defined(__GNUC__) || defined(__clang__)) && defined(__x86_64__)
+#define DFB_INLINE inline __attribute__((always_inline))
+#if defined(__x86_64__)
 #define DFB_HAS_AVX2_CLONES 1
 #if defined(__clang__)
 #define DFB_AVX2 __attribute__((target("avx2,f16c")))
@@ -23,7 +24,6 @@
 #define DFB_AVX2 __attribute__((target("avx2,f16c"), optimize("O3")))
 #define DFB_AVX512 __attribute__((target("avx2,f16c,avx512f"), optimize("O3")))
 #endif
-#define DFB_INLINE inline __attribute__((always_inline))
 // Calls one of two functions with the same arguments: the second one if cpuHasAvx2(). On other architectures the second
 // one need not exist.
 #define DFB_FASTEST(plain, avx2, ...) (::dfb::detail::cpuHasAvx2() ? avx2(__VA_ARGS__) : plain(__VA_ARGS__))
@@ -31,10 +31,9 @@
 #else
 #define DFB_FASTEST(plain, avx2, ...) plain(__VA_ARGS__)
 #define DFB_AVX2
-#define DFB_INLINE inline
 #endif
 
-#if defined(__SSE2__) || defined(_M_X64)
+#if defined(__SSE2__)
 #include <xmmintrin.h>
 #endif
 
@@ -84,26 +83,12 @@ inline auto fastest(Arguments... arguments) noexcept
 // evict each other. Always inlined, as GCC removes calls of functions that only prefetch.
 DFB_INLINE void prefetch(const std::byte* from, std::size_t bytes)
 {
-#if defined(__GNUC__)
     for (std::size_t i = 0; i < bytes; i += 64)
         __builtin_prefetch(from + i, 0, 2);
-#else
-    (void)from, (void)bytes;
-#endif
 }
 
 // How many zeros are below the lowest bit that is set. At least one bit must be set.
-inline int zerosBelow(std::uint64_t bits) noexcept
-{
-#if defined(__GNUC__)
-    return __builtin_ctzll(bits);
-#else
-    int count = 0;
-    for (; !(bits & 1); bits >>= 1)
-        ++count;
-    return count;
-#endif
-}
+inline int zerosBelow(std::uint64_t bits) noexcept { return __builtin_ctzll(bits); }
 
 // Calls f(first, count) for each run of bits that are set, from the lowest on.
 template <class F>
@@ -126,14 +111,14 @@ class FloatEnvironment {
 public:
     FloatEnvironment(const FloatEnvironment&) = delete;
     FloatEnvironment& operator=(const FloatEnvironment&) = delete;
-#if defined(__SSE2__) || defined(_M_X64)
+#if defined(__SSE2__)
     FloatEnvironment() : saved_(_mm_getcsr()) { _mm_setcsr(saved_ & ~flushAndDenormalsZero); }
     ~FloatEnvironment() { _mm_setcsr(saved_); }
 
 private:
     static constexpr unsigned flushAndDenormalsZero = 0x8040;
     unsigned saved_;
-#elif defined(__aarch64__) && defined(__GNUC__) // defined by Clang as well
+#elif defined(__aarch64__)
     FloatEnvironment() : saved_(controlRegister()) { setControlRegister(saved_ & ~flushToZero); }
     ~FloatEnvironment() { setControlRegister(saved_); }
 

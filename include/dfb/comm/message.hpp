@@ -63,7 +63,7 @@ inline std::uint32_t crc32cByTable(const std::byte* data, std::size_t byteCount,
 using Crc32cFunction = std::uint32_t (*)(const std::byte*, std::size_t, std::uint32_t);
 
 // Uses the processor's instruction, where there is one.
-#if defined(__x86_64__) && defined(__GNUC__) // Clang's, too
+#if defined(__x86_64__)
 __attribute__((target("sse4.2"))) inline std::uint32_t crc32cByInstruction(const std::byte* data, std::size_t byteCount,
                                                                            std::uint32_t before)
 {
