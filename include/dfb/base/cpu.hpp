@@ -11,6 +11,7 @@
 
 #include <dfb/version.hpp>
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 
@@ -102,6 +103,17 @@ void forEachRun(std::uint64_t bits, const F& f)
         f(at, run);
         bits = run == 64 ? 0 : bits >> run;
         at += run;
+    }
+}
+
+// Calls f(word, bits) for each word of 64 bits that has some of the bits [begin, end): its index, and which bits those
+// are.
+template <class F>
+void forEachWord(int begin, int end, const F& f)
+{
+    for (int first = begin / 64 * 64; first < end; first += 64) {
+        const int low = std::max(begin, first) - first, high = std::min(end, first + 64) - first;
+        f(static_cast<std::size_t>(first / 64), ~std::uint64_t{0} << low & ~std::uint64_t{0} >> (64 - high));
     }
 }
 

@@ -3,7 +3,6 @@
 
 #include <dfb/base/cpu.hpp>
 
-#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
@@ -30,7 +29,8 @@ public:
     {
         if (bits_.empty())
             return;
-        forEachWord(x, y, count, [](std::uint64_t& known, std::uint64_t range, int) { known &= ~range; });
+        std::uint64_t* const row = rowOf(y);
+        forEachWord(x, x + count, [&](std::size_t word, std::uint64_t range) { row[word] &= ~range; });
     }
 
     // Pixels [x, x + count) of row y become the background. Calls write(x, count) for each run of those that are not
@@ -44,16 +44,18 @@ public:
             return;
         }
         int begin = 0, end = 0; // a run that may go on in the next word
-        forEachWord(x, y, count, [&](std::uint64_t& known, std::uint64_t range, int first) {
-            const std::uint64_t missing = range & ~known;
-            known |= range;
+        std::uint64_t* const row = rowOf(y);
+        forEachWord(x, x + count, [&](std::size_t word, std::uint64_t range) {
+            const std::uint64_t missing = range & ~row[word];
+            row[word] |= range;
             forEachRun(missing, [&](int at, int run) {
-                if (first + at != end) {
+                const int first = 64 * static_cast<int>(word) + at;
+                if (first != end) {
                     if (end > begin)
                         write(begin, end - begin);
-                    begin = first + at;
+                    begin = first;
                 }
-                end = first + at + run;
+                end = first + run;
             });
         });
         if (end > begin)
@@ -61,17 +63,7 @@ public:
     }
 
 private:
-    // Calls f(word, bits of the range in it, x of its first bit).
-    template <class F>
-    void forEachWord(int x, int y, int count, const F& f)
-    {
-        const int end = x + count;
-        std::uint64_t* row = bits_.data() + wordsPerRow_ * static_cast<std::size_t>(y);
-        for (int first = x / 64 * 64; first < end; first += 64) {
-            const int low = std::max(x, first) - first, high = std::min(end, first + 64) - first;
-            f(row[first / 64], ~std::uint64_t{0} << low & ~std::uint64_t{0} >> (64 - high), first);
-        }
-    }
+    std::uint64_t* rowOf(int y) { return bits_.data() + wordsPerRow_ * static_cast<std::size_t>(y); }
 
     std::int64_t epoch_ = 0;
     std::size_t wordsPerRow_ = 0;

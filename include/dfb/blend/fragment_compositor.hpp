@@ -300,11 +300,8 @@ private:
         isCovered.assign(static_cast<std::size_t>(width / 64 + 1), 0);
         for (const FragmentRow& r : active_)
             for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span)
-                for (int x = span->x, end = span->x + span->count; x < end;) {
-                    const int some = std::min(end - x, 64 - x % 64);
-                    isCovered[static_cast<std::size_t>(x / 64)] |= ~std::uint64_t{0} >> (64 - some) << x % 64;
-                    x += some;
-                }
+                detail::forEachWord(span->x, span->x + span->count,
+                                    [&](std::size_t word, std::uint64_t bits) { isCovered[word] |= bits; });
         for (std::size_t word = 0; word < isCovered.size(); ++word)
             detail::forEachRun(isCovered[word],
                                [&](int at, int count) { joinRun(static_cast<int>(64 * word) + at, count); });

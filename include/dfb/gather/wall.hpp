@@ -2,6 +2,7 @@
 // into pictures.
 #pragma once
 
+#include <dfb/base/cpu.hpp>
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/exec.hpp>
 #include <dfb/frame/agreement.hpp>
@@ -296,14 +297,11 @@ private:
     {
         std::uint64_t twice = 0;
         for (int y = part.y0; y < part.y1; ++y)
-            for (int x = part.x0; x < part.x1; x = (x / 64 + 1) * 64) {
-                const int count = std::min(64 - x % 64, part.x1 - x);
-                const std::uint64_t pixels = ~std::uint64_t{0} >> (64 - count) << x % 64;
-                std::uint64_t& word =
-                    picture.covered[static_cast<std::size_t>(y) * wordsPerRow() + static_cast<std::size_t>(x) / 64];
-                twice |= word & pixels;
-                word |= pixels;
-            }
+            forEachWord(part.x0, part.x1, [&](std::size_t word, std::uint64_t pixels) {
+                std::uint64_t& covered = picture.covered[static_cast<std::size_t>(y) * wordsPerRow() + word];
+                twice |= covered & pixels;
+                covered |= pixels;
+            });
         if (twice != 0)
             failMalformed("a part of a display overlaps another");
     }
