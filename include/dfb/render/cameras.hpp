@@ -88,7 +88,7 @@ public:
         const double pixels = 0.5
                               * std::max(detail::length(rows_[0].normal) * width,
                                          detail::length(rows_[1].normal) * height); // per unit, times w
-        const double unit = isOrthographic_ ? 1 : detail::length(w.normal);         // w at distance 1
+        const double unit = detail::length(w.normal); // w at distance 1; 0 if orthographic
         return detail::footprintOf(bounds, width, height, [&](const Vec3d& p) {
             const Vec3d d = p - eye_;
             const double depth = w.at(p);
@@ -96,10 +96,9 @@ public:
             const double largest = detail::length(p) + detail::length(eye_) + 2 * way;
             return detail::SeenCorner{
                 depth,
-                isOrthographic_ ? 0
-                                : unit * (1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) + 1e-7 * largest),
+                unit * (1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) + 1e-7 * largest),
                 {0.5 * width * (1 + rows_[0].at(p) / depth), 0.5 * height * (1 - rows_[1].at(p) / depth)},
-                (5e-7 * largest + (isOrthographic_ ? 0 : 2e-7 * unit * dot(d, d) / depth)) * pixels / depth};
+                (5e-7 * largest + 2e-7 * unit * dot(d, d) / depth) * pixels / depth};
         });
     }
 
