@@ -191,9 +191,8 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, detail::pixelsOf(Size)> {
                 std::fill(std::begin(values), std::end(values), noId);
             else if (channel == detail::Depth)
                 std::fill(std::begin(values), std::end(values), infinity);
-            else if (channel == detail::Far)
-                std::fill(std::begin(values), std::end(values),
-                          -infinity); // not set: no farther than the depth
+            else if (channel == detail::Far) // not set: no farther than the depth
+                std::fill(std::begin(values), std::end(values), -infinity);
             else
                 std::memset(values, 0, sizeof values);
         });

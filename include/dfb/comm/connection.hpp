@@ -9,7 +9,6 @@
 #include <dfb/comm/progress.hpp>
 #include <dfb/comm/reduction.hpp>
 #include <dfb/comm/transport.hpp>
-#include <dfb/compiled.hpp>
 #include <dfb/exec.hpp>
 #include <dfb/fwd.hpp>
 
@@ -617,16 +616,12 @@ std::shared_ptr<Connection> connect(const typename Transport::Communicator& comm
 namespace detail {
 
 // Makes an executor with Connection::threadShare() threads. If the system gives no threads, the connection fails.
-DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(Connection& connection);
-
-#if DFB_HAS_BODIES
-DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(Connection& connection)
+inline std::shared_ptr<ThreadExecutor> makeThreads(Connection& connection)
 {
     std::shared_ptr<ThreadExecutor> threads;
     connection.giveUpIfThrows([&] { threads = std::make_shared<ThreadExecutor>(connection.threadShare()); });
     return threads;
 }
-#endif
 
 } // namespace detail
 
