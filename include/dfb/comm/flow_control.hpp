@@ -198,8 +198,8 @@ public:
         free_ -= extraOf(in, in.granted);
         inboxBytes_ -= byteCount;
         // Not every message is answered by a Credit. But the bytes that the sender has not been told of must stay below
-        // its part of the pool, as it may wait for them.
-        if (in.consumed - in.told >= allowance_ / 2)
+        // its part of the pool, as it may wait for them. Also below 4 MiB: a Credit shows that messages are taken.
+        if (in.consumed - in.told >= std::min<std::uint64_t>(allowance_ / 2, 4 << 20))
             grant(source, in, in.consumed + allowance_);
         serve(lock);
     }

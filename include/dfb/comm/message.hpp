@@ -128,7 +128,7 @@ enum class MessageKind : std::uint8_t {
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb, magicSwapped = 0xfb0d;
-    static constexpr std::uint8_t formatVersion = 14;
+    static constexpr std::uint8_t formatVersion = 15;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;
@@ -152,6 +152,18 @@ T loadAs(const std::byte* bytes)
     T value;
     std::memcpy(&value, bytes, sizeof value);
     return value;
+}
+
+// Whether a message says that its sender lives, or why it cannot go on. Such a message must not wait behind pixels: on
+// a slow network the receiver would take its sender for dead.
+inline bool isUrgent(const Buffer& message)
+{
+    if (message.size() < sizeof(MessageHeader))
+        return false;
+    const auto header = loadAs<MessageHeader>(message.data());
+    return header.magic == MessageHeader::magicNumber
+           && (header.kind == MessageKind::Ping || header.kind == MessageKind::Pong
+               || header.kind == MessageKind::Failure);
 }
 
 // Writes values one after the other; returns where the last ends.

@@ -15,6 +15,7 @@
 #include <dfb/base/function_ref.hpp>
 #include <dfb/base/processors.hpp>
 #include <dfb/comm/connection.hpp>
+#include <dfb/comm/message.hpp>
 #include <dfb/comm/mpi_calls.hpp>
 #include <dfb/comm/mpi_ranks.hpp>
 #include <dfb/comm/node_memory.hpp>
@@ -372,10 +373,15 @@ private:
         }
         for (auto& [destination, message] : starting_) {
             Peer& peer = peers_[static_cast<std::size_t>(destination)];
+            peer.addressed = true;
+            if (detail::isUrgent(message) && detail::PacketWriter::canHold(message.size())) {
+                packet_.add({message.size(), 0, Record::Message}, message.data(), message.size());
+                sendPacket(destination);
+                continue;
+            }
             if (peer.waiting.empty())
                 waitingPeers_.push_back(destination);
             peer.waiting.push(std::move(message));
-            peer.addressed = true;
         }
         starting_.clear();
 
