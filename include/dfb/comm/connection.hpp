@@ -111,8 +111,11 @@ public:
         : config_(std::move(config)), pool_(std::move(pool)), link_(std::move(link))
     {
         link_->start(*this);
-        if (!hasOwnThread())
+        if (!hasOwnThread()) {
+            if (link_->needsPolling())
+                tended().add(this);
             return;
+        }
         try {
             progress_.start();
             if (heartbeat_.isOn())
@@ -129,6 +132,7 @@ public:
     // and does not wait: they may never come here.
     ~Connection()
     {
+        tended().remove(this);
         if (std::uncaught_exceptions() > exceptions_ && thrownByAll_.expired())
             leave("an exception has ended its connection");
         end();
@@ -152,8 +156,9 @@ public:
     bool isOversubscribed() const noexcept { return isOversubscribed_; }
 
     // Moves messages, and returns whether any moved. Not needed with a progress thread. Does nothing on a thread that
-    // may not call MPI. Never blocks.
-    bool poll() { return progress_.needsCaller() && link_->mayPoll() && progress_.tryPoll(); }
+    // may not call MPI. Never blocks. Without a progress thread it also moves those of the other such connections that
+    // the calling thread has made: a rank that waits in one of them may be needed in another.
+    bool poll() { return pollThis() || tended().pollAllBut(this); }
 
     // ---- for the objects that it serves
 
@@ -369,6 +374,54 @@ private:
         detail::SequenceWindow received;
     };
 
+    // The connections of this process whose messages only threads that wait move. Where ranks are threads, each moves
+    // only its own.
+    class Tended {
+    public:
+        void add(Connection* connection)
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            all_.push_back(connection);
+            count_ = all_.size();
+        }
+        void remove(Connection* connection) // waits until nobody polls it
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            all_.erase(std::remove(all_.begin(), all_.end(), connection), all_.end());
+            count_ = all_.size();
+        }
+        bool pollAllBut(const Connection* own)
+        {
+            static thread_local bool isPolling = false; // it does not poll in turn
+            if (count_ == 0 || isPolling)
+                return false;
+            const std::unique_lock<std::mutex> lock(mutex_, std::try_to_lock);
+            if (!lock.owns_lock())
+                return false;
+            isPolling = true;
+            bool moved = false;
+            try {
+                for (Connection* other : all_)
+                    moved = (other != own && other->maker_ == std::this_thread::get_id() && other->pollThis()) || moved;
+            } catch (const std::exception&) { // of a transport that throws: its own callers will see it
+            }
+            isPolling = false;
+            return moved;
+        }
+
+    private:
+        std::mutex mutex_;
+        std::vector<Connection*> all_; // under mutex_
+        std::atomic<std::size_t> count_{0};
+    };
+    static Tended& tended()
+    {
+        static Tended& all = *new Tended; // never destroyed: connections may be, after it
+        return all;
+    }
+
+    bool pollThis() { return progress_.needsCaller() && link_->mayPoll() && progress_.tryPoll(); }
+
     void leave(const char* why) { giveUp(detail::errorInfo(ErrorKind::Transport, why, rank())); }
 
     void end()
@@ -554,7 +607,12 @@ private:
             config_.onPeerLost(error);
     }
 
-    void waiting() override { beat(Clock::now(), true); }
+    void waiting() override
+    {
+        beat(Clock::now(), true);
+        if (!hasOwnThread())
+            tended().pollAllBut(this);
+    }
 
     void tellReceivers()
     {
@@ -563,6 +621,7 @@ private:
             receiver->connectionFailed();
     }
 
+    const std::thread::id maker_ = std::this_thread::get_id();
     const NetworkConfig config_;
     const int exceptions_ = std::uncaught_exceptions();
     std::shared_ptr<MemoryPool> pool_;

@@ -235,6 +235,36 @@ TEST_CASE("Two framebuffers on one connection, and one with its own, with frames
         b.reset(), a.reset();
 }
 
+// A rank that waits for room in `b` sends nothing for `a`, unless it moves the messages of both.
+TEST_CASE("Two framebuffers with connections of their own, whose messages only waiting threads move", "[messaging]")
+{
+    using Fb = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
+    dfb::FrameBufferConfig config(1024, 1024);
+    config.messages.poolBytes = 1 << 20; // far less than a frame needs
+    config.executor = std::make_shared<dfb::CallerExecutor>();
+    dfb::NetworkConfig network;
+    network.progress = dfb::Progress::Caller;
+    Fb a(MPI_COMM_WORLD, config, network), b(MPI_COMM_WORLD, config, network);
+    const auto z = static_cast<float>(-a.rank());
+    const dfb::World world({{static_cast<std::uint32_t>(a.rank()), {{-1, -1, z}, {1, 1, z + 1}}}});
+    const dfb::PerspectiveCamera camera({0, 0, 6}, {0, 0, 0}, {0, 1, 0}, 30);
+    const auto draw = [](const dfb::Brick&, auto& tile) {
+        tile.forEachPixel([](int x, int y, float* rgba, float& depth) {
+            rgba[0] = 0.1f;
+            rgba[3] = 0.3f + 1e-5f * static_cast<float>(x);
+            depth = 1e-4f * static_cast<float>(y);
+        });
+    };
+    dfb::FrameConfig params;
+    params.timeout = std::chrono::seconds(20);
+    dfb::DataParallelLoop loopA(a, world), loopB(b, world);
+    for (int i = 0; i < 3; ++i) {
+        auto frameA = loopA.start(camera, draw, params), frameB = loopB.start(camera, draw, params);
+        CHECK(outcomeOf([&] { frameA.end(); }) == "fine");
+        CHECK(outcomeOf([&] { frameB.end(); }) == "fine");
+    }
+}
+
 TEST_CASE("Messages that come twice are dropped and counted", "[messaging]")
 {
     const Scene s = sceneFor(6, 6);
