@@ -182,6 +182,13 @@ public:
 
     bool declared() const { return declared_; }
 
+    // The ranks that have not acknowledged this rank's manifest.
+    std::vector<int> unanswered() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return acksMissing_;
+    }
+
     // The inputs that will come, per owned tile. Read it after complete().
     const ExpectedInputs& expected() const { return expected_; }
 
@@ -206,7 +213,7 @@ private:
             take(its->input);
     }
 
-    std::mutex mutex_;
+    mutable std::mutex mutex_;
     ExpectedInputs expected_;                  // as of the last complete()
     std::vector<int> changedRanks_;            // ranks that have told this owner something new in this frame
     std::vector<ExpectedInput> changedInputs_; // their new inputs

@@ -776,7 +776,7 @@ private:
         pipeline_ = std::make_unique<TilePipeline>(
             pool_, config_, operations_, rank(), size(), mailbox_->address(), sendToDisplay,
             [this](const std::exception_ptr& reason, int tile) { failTile(reason, tile); });
-        outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_, config_.quiet,
+        outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_, declarations_, config_.quiet,
                                                   [this](Verdict& verdict) { addFigures(verdict); });
         // The rank after the display rank hands out jobs, as the display rank has enough to do.
         jobs_.emplace(*mailbox_, open_, *outcome_, (config_.image.displayRank + 1) % size());

@@ -5,6 +5,7 @@
 #include <dfb/base/function_ref.hpp>
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/comm/quiescence.hpp>
+#include <dfb/frame/declarations.hpp>
 #include <dfb/frame/open_frame.hpp>
 #include <dfb/frame/tile_pipeline.hpp>
 #include <dfb/frame/verdict.hpp>
@@ -19,6 +20,7 @@
 #include <optional>
 #include <string>
 #include <utility>
+#include <vector>
 
 DFB_NAMESPACE_BEGIN
 namespace detail {
@@ -34,9 +36,10 @@ public:
 
     // `quiet`: how long end() waits before it first looks whether any message is under way. `addFigures(verdict)` adds
     // this rank's counts of the frame to its vote. The others must live as long as this object.
-    FrameOutcome(Mailbox& mailbox, OpenFrame& frame, TilePipeline& tiles, std::chrono::milliseconds quiet,
-                 std::function<void(Verdict&)> addFigures)
-        : mailbox_(mailbox), frame_(frame), tiles_(tiles), addFigures_(std::move(addFigures)), quiescence_(quiet)
+    FrameOutcome(Mailbox& mailbox, OpenFrame& frame, TilePipeline& tiles, const Declarations& declarations,
+                 std::chrono::milliseconds quiet, std::function<void(Verdict&)> addFigures)
+        : mailbox_(mailbox), frame_(frame), tiles_(tiles), declarations_(declarations),
+          addFigures_(std::move(addFigures)), quiescence_(quiet)
     {
     }
 
@@ -79,6 +82,7 @@ public:
             reason->frame = frame_.next();
             tellOthers(*reason); // before this rank's vote
         }
+        hasNotBegun_ = reason.has_value();
         auto& early = frame_.open(reason);
         if (reason) {
             dropRest(reason->kind);
@@ -195,6 +199,7 @@ public:
             Verdict mine;
             mine.terms = terms_;
             mine.error = frame_.reason();
+            mine.hasNotBegun = hasNotBegun_;
             addFigures_(mine);
             verdictSpan_.emplace(mailbox_.trace(), TraceEvent::Kind::Verdict, frame_.number());
             if (TraceEvent* event = verdictSpan_->event())
@@ -419,7 +424,11 @@ private:
         if (!frame_.areTilesKnown()) {
             info.message = "not all ranks have declared their inputs";
             info.expected = mailbox_.size();
-            addWaitedFor(info, {AllDeclared, frame_.number()});
+            const std::vector<int> silent = declarations_.unanswered();
+            if (silent.empty())
+                addWaitedFor(info, {AllDeclared, frame_.number()});
+            else
+                addSilent(info, silent);
         } else if (!frame_.areTilesFinished()) {
             info = tiles_.table().missing();
             if (info.message.empty())
@@ -454,6 +463,19 @@ private:
             info.from = missing.front().rank;
     }
 
+    // Adds to the message the ranks that have not answered this rank's manifest: they have not begun this frame.
+    static void addSilent(ErrorInfo& info, const std::vector<int>& ranks)
+    {
+        constexpr std::size_t most = 8;
+        const char* separator = ", waiting for";
+        for (std::size_t i = 0; i < std::min(most, ranks.size()); ++i)
+            info.message += printed("%s rank %d", std::exchange(separator, ","), ranks[i]);
+        if (ranks.size() > most)
+            info.message += printed(" and %zu more", ranks.size() - most);
+        if (ranks.size() == 1)
+            info.from = ranks.front();
+    }
+
     [[noreturn]] void giveUpVerdict()
     {
         mailbox_.connection().throwIfFailed();
@@ -462,6 +484,8 @@ private:
             placed(errorInfo(ErrorKind::Transport, printed("not all ranks have ended this frame after %lld ms",
                                                            static_cast<long long>(after.count()))));
         addWaitedFor(info, verdictKey());
+        if (const auto reason = frame_.reason(); reason && isMissing(reason->kind))
+            info.message += "; " + reason->message;
         if (const std::string lost = mailbox_.connection().lost(); !lost.empty())
             info.message += "; " + lost;
         mailbox_.connection().giveUp(info);
@@ -471,9 +495,10 @@ private:
     Mailbox& mailbox_;
     OpenFrame& frame_;
     TilePipeline& tiles_;
+    const Declarations& declarations_;
     std::function<void(Verdict&)> addFigures_;
     FrameTerms terms_;
-    bool lastFailed_ = false;
+    bool lastFailed_ = false, hasNotBegun_ = false;
     std::atomic<bool> isCreditInDoubt_{false}; // something is missing that may be credit
     std::optional<Verdict> verdict_;           // set once, before the frame is Decided
     std::optional<TraceSpan> verdictSpan_;     // from this rank's vote on

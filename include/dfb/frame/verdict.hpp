@@ -151,8 +151,9 @@ static_assert(std::has_unique_object_representations_v<FrameTerms>); // no byte 
 
 struct Verdict {
     std::optional<ErrorInfo> error;
-    FrameTerms terms;      // the parameters of begin(), which should be the same on all ranks
-    std::string differing; // which of them differ, in words
+    bool hasNotBegun = false; // a rank could not make its parameters, so they may differ for that reason
+    FrameTerms terms;         // the parameters of begin(), which should be the same on all ranks
+    std::string differing;    // which of them differ, in words
     struct Sums : FrameSums {
         std::int64_t inputsLeft = 0;      // inputs sent, less inputs that have come
         std::int64_t tilesEndedEarly = 0; // finished before all their inputs had come
@@ -169,7 +170,7 @@ struct Verdict {
     SmallBytes bytes() const
     {
         SmallBytes out;
-        out.put(static_cast<std::uint8_t>(error.has_value()));
+        out.put(static_cast<std::uint8_t>(error ? 1 + hasNotBegun : 0));
         if (error)
             put(out, *error);
         out.put(terms);
@@ -193,9 +194,10 @@ struct Verdict {
         ByteReader in(bytes);
         Verdict v;
         const auto failed = in.get<std::uint8_t>();
-        in.require(failed <= 1);
+        in.require(failed <= 2);
         if (failed)
             v.error = getErrorInfo(in);
+        v.hasNotBegun = failed == 2;
         v.terms = in.get<FrameTerms>();
         v.differing = in.getText();
         v.sums = in.get<Sums>();
@@ -328,11 +330,12 @@ struct Verdict {
         const Verdict b = from(second);
         if (b.error)
             a.error = a.error ? chosen(*a.error, *b.error) : *b.error;
+        a.hasNotBegun = a.hasNotBegun || b.hasNotBegun;
         if (a.differing.empty())
             a.differing = !b.differing.empty() ? b.differing : a.terms.difference(b.terms);
         // Other errors follow from different parameters. But if a camera throws on one rank, its FrameConfig::order is
         // missing for that reason. Then there is no partial image, either.
-        const bool isCause = a.error && a.error->kind == ErrorKind::UserCode;
+        const bool isCause = a.error && (a.hasNotBegun || a.error->kind == ErrorKind::UserCode);
         if (!a.differing.empty() && isCause && a.terms.allowPartial != 0)
             a.differing += printed("; rank %d: %s", a.error->rank, a.error->message.c_str());
         if (!a.differing.empty() && (!isCause || a.terms.allowPartial != 0))

@@ -217,13 +217,16 @@ namespace detail {
 class FromWorld {
 public:
     // Sets config.order and config.owners. `isOrdered`: inputs come in an order that the loop was given, without depth.
+    // `own`: bricks that must be among those of `world`.
     // Returns the camera's exception, or null. Pass it to begin(), which then makes the frame fail on all ranks. Call
     // begin() even then: other ranks may have sent inputs of this frame already.
     template <class FrameBuffer, class Camera>
     std::exception_ptr set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
-                           bool isOrdered = false)
+                           bool isOrdered = false, const World* own = nullptr)
     {
         try {
+            if (own)
+                requireBricks(*own, world);
             if constexpr (FrameBuffer::takesOrder && has_common_eye_v<Camera>)
                 if (!isOrdered)
                     findOrder(config, world, camera.commonEye());
@@ -238,6 +241,17 @@ public:
     }
 
 private:
+    static void requireBricks(const World& own, const SharedWorld& world)
+    {
+        for (const Brick& brick : own.bricks()) {
+            const auto its = std::lower_bound(world.bricks().begin(), world.bricks().end(), brick.id,
+                                              [](const Brick& other, std::uint32_t id) { return other.id < id; });
+            if (its == world.bricks().end() || its->id != brick.id || !(its->bounds == brick.bounds))
+                failArgument("brick %u is not in the SharedWorld with these bounds: make a new one when bricks change",
+                             brick.id);
+        }
+    }
+
     // Sets config.order if it is not set, all rays begin at `eye`, and the bricks have an order. The time grows with
     // the square of the number of bricks, so it does nothing for more than 1024.
     void findOrder(FrameConfig& config, const SharedWorld& world, const std::optional<Vec3>& eye)
@@ -326,10 +340,10 @@ public:
     // Not collective. Waits for nothing.
     DataParallelLoop(FrameBuffer& fb, const World& world) : fb_(fb), world_(world) {}
 
-    // `all` has the bricks of all ranks, those of `world` among them. It must outlive the loop. If the bricks have an
-    // order from front to back for the camera, the loop sets FrameConfig::order: AlphaBlend then sorts nothing, and
-    // sends depth only if the image has it. If ranks are on several nodes, tiles belong to ranks near their pixels: see
-    // ImageConfig::ownerMap.
+    // `all` has the bricks of all ranks, and must outlive the loop. If a brick of `world` is not among them, frames
+    // fail (InvalidArgument). If the bricks have an order from front to back for the camera, the loop sets
+    // FrameConfig::order: AlphaBlend then sorts nothing, and sends depth only if the image has it. If ranks are on
+    // several nodes, tiles belong to ranks near their pixels: see ImageConfig::ownerMap.
     DataParallelLoop(FrameBuffer& fb, const World& world, const SharedWorld& all) : fb_(fb), world_(world), all_(&all)
     {
     }
@@ -347,7 +361,7 @@ public:
                                       const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
-        const std::exception_ptr failure = all_ ? fromWorld_.set(params, fb_, *all_, camera) : nullptr;
+        const std::exception_ptr failure = all_ ? fromWorld_.set(params, fb_, *all_, camera, false, &world_) : nullptr;
         auto frame = fb_.begin(params, tileData, pixelData, failure);
         bricks_.template forEach<RenderBrick>(fb_, frame, world_, camera, [&](const Brick& brick, auto& tile) {
             renderBrick(brick, tile);

@@ -1677,11 +1677,16 @@ TEST_CASE("A pixel operation that cannot be copied on one rank: the others learn
 namespace {
 
 struct ThrowingEye : dfb::PerspectiveCamera {
-    bool throws = false;
+    bool throws = false, isInvalid = false;
 
-    explicit ThrowingEye(bool isCulprit) : PerspectiveCamera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 40), throws(isCulprit) {}
+    explicit ThrowingEye(bool isCulprit, bool throwsInvalid = false)
+        : PerspectiveCamera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 40), throws(isCulprit), isInvalid(throwsInvalid)
+    {
+    }
     std::optional<dfb::Vec3> commonEye() const
     {
+        if (throws && isInvalid)
+            throw dfb::InvalidArgument("no such eye");
         if (throws)
             throw std::runtime_error("no such eye");
         return eye();
@@ -1703,6 +1708,8 @@ struct MadeLate : dfb::AlphaBlend {
 
 TEST_CASE("A camera that throws on one rank is why a frame fails, also if it may be partial", "[errors]")
 {
+    const bool isInvalid = GENERATE(false, true);
+    const bool isPartial = GENERATE(false, true);
     std::vector<std::string> texts(3);
     dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config(128, 64);
@@ -1713,15 +1720,15 @@ TEST_CASE("A camera that throws on one rank is why a frame fails, also if it may
         const dfb::SharedWorld all(fb, world);
         dfb::DataParallelLoop loop(fb, world, all);
         dfb::FrameConfig params;
-        params.allowPartial = true;
+        params.allowPartial = isPartial;
         texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
             loop.render(
-                ThrowingEye(fb.rank() == 1), [](const dfb::Brick&, auto&) {}, params);
+                ThrowingEye(fb.rank() == 1, isInvalid), [](const dfb::Brick&, auto&) {}, params);
         });
     });
     INFO(joined(texts));
     CHECK(allSame(texts));
-    CHECK(has(texts[0], "rank 1: "));
+    CHECK(has(texts[0], "rank 1"));
     CHECK(has(texts[0], "no such eye"));
 }
 
@@ -1753,6 +1760,33 @@ TEST_CASE("A camera that throws on one rank is why a frame fails, also if its vo
         INFO(text);
         CHECK(has(text, "no such eye"));
     }
+}
+
+TEST_CASE("A frame fails if a brick has moved since the SharedWorld was made, and the next is fine", "[errors]")
+{
+    std::vector<std::string> texts(2), after(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<dfb::AlphaBlend> fb(communicator, {128, 64});
+        const auto rank = static_cast<std::size_t>(fb.rank());
+        const auto worldAt = [&](float z) {
+            return dfb::World({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, z}, {1, 1, z}}}});
+        };
+        const dfb::World world = worldAt(static_cast<float>(fb.rank()));
+        const dfb::World moved = fb.rank() == 1 ? worldAt(3) : world;
+        const dfb::SharedWorld all(fb, world);
+        const auto frameOf = [&](const dfb::World& its) {
+            return outcomeOf([&] {
+                dfb::DataParallelLoop(fb, its, all).render(ThrowingEye(false), [](const dfb::Brick&, auto&) {});
+            });
+        };
+        texts[rank] = frameOf(moved);
+        after[rank] = frameOf(world);
+    });
+    INFO(joined(texts));
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "rank 1"));
+    CHECK(has(texts[0], "brick 1 is not in the SharedWorld with these bounds"));
+    CHECK(after == std::vector<std::string>{"fine", "fine"});
 }
 
 TEST_CASE("Of a partial frame only the tile is lost whose operation cannot be made", "[errors]")

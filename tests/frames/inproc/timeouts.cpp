@@ -468,7 +468,9 @@ TEST_CASE("A rank that does not begin the frame: a TransportError on the others,
         std::vector<std::string> texts{3};
         std::vector<double> ms = std::vector<double>(3);
     };
-    const auto runCase = [](int absent) {
+    // `declares`: the others have inputs to declare, so they wait for the absent rank's answers.
+    const bool declares = GENERATE(false, true);
+    const auto runCase = [declares](int absent) {
         std::promise<void> othersDone;
         const auto othersAreDone = othersDone.get_future().share();
         std::atomic<int> left{2};
@@ -478,9 +480,12 @@ TEST_CASE("A rank that does not begin the frame: a TransportError on the others,
             const auto rank = static_cast<std::size_t>(fb.rank());
             if (fb.rank() == absent)
                 othersAreDone.wait_for(std::chrono::seconds(20));
+            std::vector<dfb::TileInput> inputs;
+            for (int tile = 0; declares && tile < fb.layout().tileCount(); ++tile)
+                inputs.push_back({tile, static_cast<std::uint32_t>(rank), 0});
             o.texts[rank] = outcomeOf([&] {
                 auto frame = fb.begin(timed(true));
-                frame.declare({});
+                frame.declare(inputs);
                 const auto start = Clock::now();
                 try {
                     frame.end();
@@ -494,11 +499,13 @@ TEST_CASE("A rank that does not begin the frame: a TransportError on the others,
         });
         return o;
     };
-    eachAtOnce(std::vector<int>{0, 1, 2}, runCase, [](int absent, const Outcome& o) {
+    eachAtOnce(std::vector<int>{0, 1, 2}, runCase, [declares](int absent, const Outcome& o) {
         INFO("rank " << absent << joined(o.texts));
         for (std::size_t rank = 0; rank < 3; ++rank) {
             CHECK(has(o.texts[rank], "TransportError"));
             CHECK(o.ms[rank] < 2 * limitMs + marginMs);
+            if (declares)
+                CHECK(has(o.texts[rank], "declared their inputs, waiting for rank " + std::to_string(absent)));
         }
     });
 }
