@@ -36,6 +36,12 @@ int write(const char* path)
             for (const std::byte level : dfb::testing::runTileOp<Op>(in, in.order(), format, true, {}, true).color)
                 put(1.0f + 0x1p-23f * static_cast<float>(level));
     }
+    for (int layers = 2; layers <= 32; layers *= 2) {
+        const auto in = dfb::testing::greyLayers<16>(1, layers);
+        for (const std::byte level :
+             dfb::testing::runTileOp<dfb::BasicAlphaBlend<16>>(in, in.order(), dfb::OutputFormat::RGBA8).color)
+            put(static_cast<float>(level));
+    }
     return file.flush() ? 0 : 1;
 }
 

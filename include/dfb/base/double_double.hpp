@@ -28,6 +28,9 @@ struct DoubleDouble {
     // some processors lack.
     static DoubleDouble product(double a, float b) noexcept
     {
+#if defined(__FMA__) || defined(__FP_FAST_FMA)
+        return product(a, static_cast<double>(b)); // here compilers may fuse `p` with sums that it goes into
+#endif
         std::uint64_t bits = 0;
         std::memcpy(&bits, &a, sizeof bits);
         bits &= ~std::uint64_t{0x7ffffff};

@@ -385,7 +385,15 @@ DFB_INLINE void blendExactlyPlain(const ExactPixels& row, int count, const float
         }
         for (int c = 0; c < 4; ++c)
             add(row.rgba[4 * i + c], row.rgbaLow[4 * i + c], product[c], rest[c]);
+        // T (1 - a), where 1 - a is exact; elsewhere T - T a, which would cancel where a is nearly 1.
+        const float through = 1.0f - color[3];
+        const bool isExact = color[3] >= 0.5f && color[3] <= 2.0f;
+        const DoubleDouble left = DoubleDouble::product(row.transmittance[i], through);
+        const DoubleDouble closed =
+            DoubleDouble::sumOfOrdered(left.high, left.low + row.transmittanceLow[i] * static_cast<double>(through));
         add(row.transmittance[i], row.transmittanceLow[i], -product[3], -rest[3]);
+        row.transmittance[i] = isExact ? closed.high : row.transmittance[i];
+        row.transmittanceLow[i] = isExact ? closed.low : row.transmittanceLow[i];
     }
 }
 

@@ -529,6 +529,19 @@ TEST_CASE("8 bits are the exact result rounded also next to a tie", "[ops]")
         }
 }
 
+TEST_CASE("Layers of one grey over that grey are a tie in each pixel", "[ops]")
+{
+    for (int layers = 2; layers <= 32; layers *= 2) {
+        const auto in = dfb::testing::greyLayers<8>(static_cast<std::uint64_t>(layers), layers);
+        const auto out = dfb::testing::runTileOp<dfb::BasicAlphaBlend<8>>(in, in.order(), dfb::OutputFormat::RGBA8);
+        const std::vector<std::byte> expected{std::byte{128}, std::byte{128}, std::byte{128}, std::byte{255}};
+        int wrong = 0;
+        for (std::size_t i = 0; i < out.color.size(); ++i)
+            wrong += out.color[i] != expected[i % 4];
+        CHECK(wrong == 0);
+    }
+}
+
 TEST_CASE("A tie in a row does not change the levels of other pixels", "[ops]")
 {
     // The level of red at a pixel with these layers of red and alpha. Its neighbour has 1/2, which is a tie, or 0.3.

@@ -109,4 +109,23 @@ TileInputs<Size> adversarial(std::uint64_t seed, int layers, int passes, bool im
     return in;
 }
 
+// Layers of one grey over that grey: all pixels are exactly 1/2, which is a tie in 8 bits, between 127 and 128.
+template <int Size>
+TileInputs<Size> greyLayers(std::uint64_t seed, int layers)
+{
+    Random random(seed);
+    TileInputs<Size> in;
+    in.background = {0.5f, 0.5f, 0.5f, 1};
+    for (int layer = 0; layer < layers; ++layer) {
+        auto& tile = in.add(0, static_cast<std::uint32_t>(layer));
+        for (int i = 0; i < Size * Size; ++i) {
+            const float alpha = uniform(random);
+            std::fill_n(tile.color + 4 * i, 3, alpha / 2);
+            tile.color[4 * i + 3] = alpha;
+            tile.depth[i] = static_cast<float>(layer);
+        }
+    }
+    return in;
+}
+
 } // namespace dfb::testing
