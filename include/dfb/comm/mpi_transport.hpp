@@ -374,7 +374,9 @@ private:
         for (auto& [destination, message] : starting_) {
             Peer& peer = peers_[static_cast<std::size_t>(destination)];
             peer.addressed = true;
-            if (detail::isUrgent(message) && detail::PacketWriter::canHold(message.size())) {
+            // Else it goes soon, and need not overtake what was sent before it.
+            const bool isStalled = peer.inFlight >= sendsPerPeer;
+            if (isStalled && detail::isUrgent(message) && detail::PacketWriter::canHold(message.size())) {
                 packet_.add({message.size(), 0, Record::Message}, message.data(), message.size());
                 sendPacket(destination);
                 continue;
@@ -682,7 +684,14 @@ private:
     void abandon()
     {
         const bool isOver = detail::mpiSays(MPI_Finalized);
-        for (Transfers* all : {&packets_, &receives_, &sends_, &notices_})
+        int areSent = 0;
+        if (isOver
+            || MPI_Testall(static_cast<int>(notices_.requests.size()), notices_.requests.data(), &areSent,
+                           MPI_STATUSES_IGNORE)
+                   != MPI_SUCCESS
+            || !areSent)
+            new Transfers(std::move(notices_)); // several requests send one item
+        for (Transfers* all : {&packets_, &receives_, &sends_})
             for (std::size_t i = 0; i < all->requests.size(); ++i) {
                 MPI_Request& request = all->requests[i];
                 int done = 0;
