@@ -18,7 +18,7 @@ struct DoubleDouble {
         const double s = a + b, part = s - a;
         return {s, (a - (s - part)) + (b - part)};
     }
-    // The same where b is no larger than a, or 0.
+    // sum() where b is no larger than a, or 0.
     static DoubleDouble sumOfOrdered(double a, double b) noexcept
     {
         const double s = a + b;
