@@ -382,18 +382,16 @@ private:
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             all_.push_back(connection);
-            count_ = all_.size();
         }
         void remove(Connection* connection) // waits until nobody polls it
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             all_.erase(std::remove(all_.begin(), all_.end(), connection), all_.end());
-            count_ = all_.size();
         }
         bool pollAllBut(const Connection* own)
         {
             static thread_local bool isPolling = false; // it does not poll in turn
-            if (count_ == 0 || isPolling)
+            if (isPolling)
                 return false;
             const std::unique_lock<std::mutex> lock(mutex_, std::try_to_lock);
             if (!lock.owns_lock())
@@ -412,7 +410,6 @@ private:
     private:
         std::mutex mutex_;
         std::vector<Connection*> all_; // under mutex_
-        std::atomic<std::size_t> count_{0};
     };
     static Tended& tended()
     {
