@@ -405,9 +405,9 @@ DFB_COMPILED_ONCE TileOwners ImageCompositor::findOwners()
     const detail::PackedRegion packed(layout);
     owners_->start(layout);
     for (const std::vector<int>& ranks : owners_->byNode())
-        for (const int& rank : ranks)
+        for (const int rank : ranks)
             detail::forEachTile(packed.unpack(regions_[static_cast<std::size_t>(rank)]), layout,
-                                [&](int tile, const Region& pixels) { owners_->add(tile, pixels, &rank, 1); });
+                                [&](int tile, const Region& pixels) { owners_->add(tile, pixels, rank); });
     regionOwners_ =
         owners_->find(config(), blend_ != ImageBlend::InOrder, [this](int tile) { return engine_->tileOwner(tile); });
     return regionOwners_;

@@ -144,7 +144,7 @@ struct ByLinks {
         return all;
     }
 
-    enum class Way { Data, Mixed, InOrder };
+    enum class Way { Data, Mixed, Everywhere, InOrder };
 
     // Returns the hashes of the images on the display rank, an empty list elsewhere. `bytes`: sent in all frames.
     template <Way way>
@@ -161,7 +161,7 @@ struct ByLinks {
         const std::vector<dfb::Brick> all = boxes();
         for (std::size_t i = 0; i < all.size(); ++i) {
             const std::size_t rank = i * static_cast<std::size_t>(fb.size()) / all.size();
-            if (static_cast<int>(rank) == fb.rank()
+            if (static_cast<int>(rank) == fb.rank() || way == Way::Everywhere
                 || (way == Way::Mixed && static_cast<int>(rank + 1) % fb.size() == fb.rank()))
                 mine.add(all[i]);
         }
@@ -188,7 +188,7 @@ struct ByLinks {
             const auto report = [&] {
                 if constexpr (way == Way::Data)
                     return data.render(camera, shade);
-                else if constexpr (way == Way::Mixed)
+                else if constexpr (way != Way::InOrder)
                     return mixed.render(camera, shade);
                 else
                     return ordered.render(camera, dfb::visibilityOrder(world, eye), shade);
@@ -210,7 +210,7 @@ struct ByLinks {
         if (!got.empty())
             result.hash = scene::mix(result.hash ^ got.back());
         // `bytes` is the same on all ranks. A single rank sends nothing.
-        result.expect(lattice == 0 || 10 * byLinks < 9 * lattice,
+        result.expect(lattice == 0 || 10 * byLinks < 8 * lattice,
                       name + ": " + std::to_string(byLinks) + " bytes, " + std::to_string(lattice) + " by the lattice");
     }
 
@@ -219,7 +219,44 @@ struct ByLinks {
         Result result;
         compare<Way::Data>(communicator, result, "data-parallel");
         compare<Way::Mixed>(communicator, result, "mixed");
+        compare<Way::Everywhere>(communicator, result, "bricks that all ranks hold");
         compare<Way::InOrder>(communicator, result, "in order");
+        return result;
+    }
+};
+
+// In a frame of a part of the image, the tile-brick owner is asked about the tiles of that part only.
+struct PartOfImage {
+    struct Owner {
+        const std::vector<dfb::TileSamples>* samples = nullptr;
+        bool isRight = true;
+
+        int operator()(const dfb::SharedBrick& brick, int tile, int /*pass*/)
+        {
+            isRight = isRight && (!samples || (*samples)[static_cast<std::size_t>(tile)].count > 0);
+            return brick.ranks[static_cast<std::size_t>(tile) % brick.ranks.size()];
+        }
+    };
+
+    static Result run(const Transport::Communicator& communicator)
+    {
+        Result result;
+        OpFrameBuffer<dfb::BasicAlphaBlend<16>> fb(communicator, {100, 80, dfb::OutputFormat::RGBA32F}, far());
+        const dfb::World mine({{7, {{-1, -1, 0}, {1, 1, 1}}}}); // all ranks have it
+        const dfb::SharedWorld world(fb, mine);
+        Owner owner;
+        dfb::MixedParallelLoop loop(fb, world, owner);
+        const dfb::PerspectiveCamera camera({0, 0, 7}, {0, 0, 0}, {0, 1, 0}, 28);
+        const auto fill = [](const dfb::Brick&, auto& tile) { tile.fill({0.25f, 0.5f, 0.125f, 0.5f}, 1); };
+        loop.render(camera, fill);
+        const auto hash = [&] { return fb.isDisplayRank() ? hashOf(fb.image()) : 0; };
+        const std::uint64_t whole = hash();
+        dfb::FrameConfig part;
+        part.samples = dfb::samplesIn(fb.layout(), {20, 20, 60, 40});
+        owner.samples = part.samples.get();
+        const std::string outcome = scene::outcomeOf([&] { loop.render(camera, fill, part); });
+        result.expect(outcome == "fine" && owner.isRight, "tiles without samples: " + outcome);
+        result.expect(whole == hash(), "another image");
         return result;
     }
 };
@@ -297,6 +334,11 @@ TEST_CASE("Owners of a frame that cannot be, or differ between ranks, are an err
 TEST_CASE("Finished images on several nodes are sent to owners near them", "[owners]")
 {
     everywhere<frame_cases::Pictures>();
+}
+
+TEST_CASE("A tile-brick owner is not asked about tiles that are not rendered", "[owners]")
+{
+    everywhere<frame_cases::PartOfImage>();
 }
 
 TEST_CASE("Owners by the links of nodes send fewer bytes for the same image", "[owners]")

@@ -41,17 +41,19 @@ public:
         tiles_.assign(static_cast<std::size_t>(layout.tileCount()), {});
     }
 
-    // Some pixels of a tile come from one of `rankCount` ranks; it is not known which. Takes the least memory if the
-    // ranks of a node come one after the other, as in byNode().
-    void add(int tile, const Region& pixels, const int* ranks, std::size_t rankCount)
+    // Some pixels of a tile come from this rank. Takes the least memory if the ranks of a node come one after the
+    // other, as in byNode().
+    void add(int tile, const Region& pixels, int rank)
     {
-        const double share = areaOf(pixels) / static_cast<double>(rankCount);
-        for (std::size_t i = 0, next = 0; i < rankCount; i = next) {
-            const int node = nodeOf(ranks[i]);
-            while (next < rankCount && nodeOf(ranks[next]) == node)
-                ++next;
-            addPart(tiles_[static_cast<std::size_t>(tile)], node, share * static_cast<double>(next - i));
+        Tile& to = tiles_[static_cast<std::size_t>(tile)];
+        if (to.last != none && part(to.last).node == nodeOf(rank)) {
+            part(to.last).pixels += areaOf(pixels);
+            return;
         }
+        const int added = static_cast<int>(parts_.size());
+        parts_.push_back({nodeOf(rank), none, areaOf(pixels)});
+        (to.last == none ? to.first : part(to.last).next) = added;
+        to.last = added;
     }
 
     // All ranks, node by node.
@@ -80,17 +82,6 @@ private:
     Link& linkOf(int node) { return links_[static_cast<std::size_t>(node)]; }
     double& fromNode(int node) { return fromNode_[static_cast<std::size_t>(node)]; }
 
-    void addPart(Tile& tile, int node, double pixels)
-    {
-        if (tile.last != none && part(tile.last).node == node) {
-            part(tile.last).pixels += pixels;
-            return;
-        }
-        const int added = static_cast<int>(parts_.size());
-        parts_.push_back({node, none, pixels});
-        (tile.last == none ? tile.first : part(tile.last).next) = added;
-        tile.last = added;
-    }
     Part& part(int i) { return parts_[static_cast<std::size_t>(i)]; }
 
     void place(Tile& tile, double area);

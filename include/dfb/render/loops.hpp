@@ -216,13 +216,16 @@ namespace detail {
 // Finds the order and the owners of a loop's frames from a SharedWorld and a camera.
 class FromWorld {
 public:
+    // The rank that renders a brick in a tile.
+    using RankOf = FunctionRef<int(const SharedBrick& brick, int tile)>;
+
     // Sets config.order and config.owners. `isOrdered`: inputs come in an order that the loop was given, without depth.
     // `own`: bricks that must be among those of `world`.
     // Returns the camera's exception, or null. Pass it to begin(), which then makes the frame fail on all ranks. Call
     // begin() even then: other ranks may have sent inputs of this frame already.
     template <class FrameBuffer, class Camera>
     std::exception_ptr set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
-                           bool isOrdered = false, const World* own = nullptr)
+                           RankOf rankOf, bool isOrdered = false, const World* own = nullptr)
     {
         try {
             if (own)
@@ -231,9 +234,12 @@ public:
                 if (!isOrdered)
                     findOrder(config, world, camera.commonEye());
             if (!FrameBuffer::keepsState)
-                findOwners(config, fb, world, !isOrdered && !config.order, [&](const Box3& box, FoundTile found) {
-                    forEachTile(camera.project(box, fb.layout().width(), fb.layout().height()), fb.layout(), found);
-                });
+                findOwners(
+                    config, fb, world, !isOrdered && !config.order,
+                    [&](const Box3& box, FoundTile found) {
+                        forEachTile(camera.project(box, fb.layout().width(), fb.layout().height()), fb.layout(), found);
+                    },
+                    rankOf);
             return nullptr;
         } catch (...) {
             return std::current_exception();
@@ -272,7 +278,7 @@ private:
     // Sets config.owners, where ranks are on several nodes, unless it is set or the framebuffer has an owner map.
     // `hasDepth`: whether inputs have depth. `tilesOf(bounds, found)`: the tiles that a box may project to.
     void findOwners(FrameConfig& config, const FrameBufferBase& fb, const SharedWorld& world, bool hasDepth,
-                    FunctionRef<void(const Box3&, FoundTile)> tilesOf)
+                    FunctionRef<void(const Box3&, FoundTile)> tilesOf, RankOf rankOf)
     {
         if (config.owners || fb.config().image.ownerMap)
             return;
@@ -281,9 +287,12 @@ private:
         if (owners_->isOneNode())
             return;
         owners_->start(fb.layout());
+        const SamplePlan& plan = config.samples;
+        const bool isPlanned = plan && plan->size() == static_cast<std::size_t>(fb.layout().tileCount());
         for (const SharedBrick& b : world.bricks())
             tilesOf(b.bounds, [&](int tile, const Region& pixels) {
-                owners_->add(tile, pixels, b.ranks.data(), b.ranks.size());
+                if (!isPlanned || (*plan)[static_cast<std::size_t>(tile)].count > 0)
+                    owners_->add(tile, pixels, rankOf(b, tile));
             });
         config.owners = owners_->find(fb.config(), hasDepth, [&](int tile) { return fb.tileOwner(tile); });
     }
@@ -361,7 +370,9 @@ public:
                                       const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
-        const std::exception_ptr failure = all_ ? fromWorld_.set(params, fb_, *all_, camera, false, &world_) : nullptr;
+        const auto rankOf = [](const SharedBrick& brick, int) { return brick.ranks.front(); };
+        const std::exception_ptr failure =
+            all_ ? fromWorld_.set(params, fb_, *all_, camera, rankOf, false, &world_) : nullptr;
         auto frame = fb_.begin(params, tileData, pixelData, failure);
         bricks_.template forEach<RenderBrick>(fb_, frame, world_, camera, [&](const Brick& brick, auto& tile) {
             renderBrick(brick, tile);

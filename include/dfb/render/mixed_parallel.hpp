@@ -9,7 +9,8 @@
 //                                  called once a frame, before operator(): with all pairs, and the number of passes of
 //                                  each. FrameReport::figures then has the cost of each pair, for the next plan.
 // MixedParallelLoop calls both on the thread that is in start(). OrderedLoop calls operator() from several workers at
-// once as well. All ranks must get the same answers. If it picks a rank that does not hold the brick, the frame fails.
+// once as well. An owner without plan() may be asked about pass 0 more than once. All ranks must get the same answers.
+// If it picks a rank that does not hold the brick, the frame fails.
 #pragma once
 
 #include <dfb/base/detect.hpp>
@@ -169,6 +170,28 @@ DFB_DETECTS(has_plan_v,
 // A tile-brick owner of any type.
 using OwnerRef = FunctionRef<int(const SharedBrick& brick, int tile, int pass)>;
 
+// Returns the rank that renders a pass of a brick in a tile. Throws InvalidArgument if it does not hold the brick.
+inline int rankOf(const SharedBrick& brick, int tile, int pass, OwnerRef owner)
+{
+    const int rank = owner(brick, tile, pass);
+    if (!std::binary_search(brick.ranks.begin(), brick.ranks.end(), rank))
+        failArgument("the tile-brick owner gives tile %d of brick %u to rank %d, which does not hold it", tile,
+                     brick.id, rank);
+    return rank;
+}
+
+// Returns FromWorld::RankOf for the first pass. If the owner plans, it does so later in the frame, and this is a guess.
+template <class Owner>
+auto firstRank(Owner& owner)
+{
+    return [&owner](const SharedBrick& brick, int tile) {
+        if constexpr (has_plan_v<Owner>)
+            return RoundRobinBricks()(brick, tile, 0);
+        else
+            return rankOf(brick, tile, 0, [&](const SharedBrick& b, int t, int pass) { return owner(b, t, pass); });
+    };
+}
+
 // The jobs of a mixed-parallel frame.
 struct MixedWork {
     std::vector<BrickInTile> pairs; // tile by tile
@@ -205,11 +228,7 @@ private:
         for (std::size_t p = 0; p < pairs.size(); ++p) {
             const SharedBrick& brick = brickOf(world, pairs[p]);
             for (int pass = 0; pass < passes[p]; ++pass) {
-                const int rank = owner(brick, pairs[p].tile, pass);
-                if (!std::binary_search(brick.ranks.begin(), brick.ranks.end(), rank))
-                    failArgument("the tile-brick owner gives tile %d of brick %u to rank %d, which does not hold it",
-                                 pairs[p].tile, brick.id, rank);
-                if (rank == own)
+                if (rankOf(brick, pairs[p].tile, pass, owner) == own)
                     jobs.push_back({p, pass});
             }
         }
@@ -388,7 +407,7 @@ public:
                                       const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
-        const std::exception_ptr failure = fromWorld_.set(params, fb_, world_, camera);
+        const std::exception_ptr failure = fromWorld_.set(params, fb_, world_, camera, detail::firstRank(owner_));
         auto frame = fb_.begin(params, tileData, pixelData, failure);
         frame.guard([&] {
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
@@ -458,7 +477,7 @@ public:
                                       const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = false;
-        const std::exception_ptr failure = fromWorld_.set(params, fb_, world_, camera, true);
+        const std::exception_ptr failure = fromWorld_.set(params, fb_, world_, camera, detail::firstRank(owner_), true);
         auto frame = fb_.begin(params, tileData, pixelData, failure);
         frame.guard([&] {
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
