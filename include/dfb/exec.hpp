@@ -267,7 +267,8 @@ private:
 // iterations, on threads that call setTile() or poll(), and on a thread that waits for a frame. For ranks that have one
 // core each. With Progress::Caller as well, the library works only while the program calls it, and other ranks may wait
 // for that. Framebuffers whose frames are open at the same time must share one executor. A rank that waits in one frame
-// then runs the tasks of all, so that other ranks find room for their messages.
+// then runs the tasks of all, so that other ranks find room for their messages. Make and destroy framebuffers while no
+// frame is open: a rank that waits there runs no tasks.
 class CallerExecutor final : public Executor {
 public:
     ~CallerExecutor() override

@@ -113,7 +113,7 @@ public:
         link_->start(*this);
         if (!hasOwnThread()) {
             if (link_->needsPolling())
-                tended().add(this);
+                progress_.leaveToCallers();
             return;
         }
         try {
@@ -132,7 +132,6 @@ public:
     // and does not wait: they may never come here.
     ~Connection()
     {
-        tended().remove(this);
         if (std::uncaught_exceptions() > exceptions_ && thrownByAll_.expired())
             leave("an exception has ended its connection");
         end();
@@ -158,7 +157,11 @@ public:
     // Moves messages, and returns whether any moved. Not needed with a progress thread. Does nothing on a thread that
     // may not call MPI. Never blocks. Without a progress thread it also moves those of the other such connections that
     // the calling thread has made: a rank that waits in one of them may be needed in another.
-    bool poll() { return pollThis() || tended().pollAllBut(this); }
+    bool poll()
+    {
+        return (progress_.needsCaller() && link_->mayPoll() && progress_.tryPoll())
+               || ProgressThread::pollOthers(&progress_);
+    }
 
     // ---- for the objects that it serves
 
@@ -374,51 +377,6 @@ private:
         detail::SequenceWindow received;
     };
 
-    // The connections of this process whose messages only threads that wait move. Where ranks are threads, each moves
-    // only its own.
-    class Tended {
-    public:
-        void add(Connection* connection)
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            all_.push_back(connection);
-        }
-        void remove(Connection* connection) // waits until nobody polls it
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            all_.erase(std::remove(all_.begin(), all_.end(), connection), all_.end());
-        }
-        bool pollAllBut(const Connection* own)
-        {
-            static thread_local bool isPolling = false; // it does not poll in turn
-            if (isPolling)
-                return false;
-            const std::unique_lock<std::mutex> lock(mutex_, std::try_to_lock);
-            if (!lock.owns_lock())
-                return false;
-            isPolling = true;
-            bool moved = false;
-            try {
-                for (Connection* other : all_)
-                    moved = (other != own && other->maker_ == std::this_thread::get_id() && other->pollThis()) || moved;
-            } catch (const std::exception&) { // of a transport that throws: its own callers will see it
-            }
-            isPolling = false;
-            return moved;
-        }
-
-    private:
-        std::mutex mutex_;
-        std::vector<Connection*> all_; // under mutex_
-    };
-    static Tended& tended()
-    {
-        static Tended& all = *new Tended; // never destroyed: connections may be, after it
-        return all;
-    }
-
-    bool pollThis() { return progress_.needsCaller() && link_->mayPoll() && progress_.tryPoll(); }
-
     void leave(const char* why) { giveUp(detail::errorInfo(ErrorKind::Transport, why, rank())); }
 
     void end()
@@ -608,7 +566,7 @@ private:
     {
         beat(Clock::now(), true);
         if (!hasOwnThread())
-            tended().pollAllBut(this);
+            ProgressThread::pollOthers(&progress_);
     }
 
     void tellReceivers()
@@ -618,7 +576,6 @@ private:
             receiver->connectionFailed();
     }
 
-    const std::thread::id maker_ = std::this_thread::get_id();
     const NetworkConfig config_;
     const int exceptions_ = std::uncaught_exceptions();
     std::shared_ptr<MemoryPool> pool_;

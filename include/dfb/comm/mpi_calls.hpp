@@ -2,6 +2,7 @@
 // The only header that includes mpi.h.
 #pragma once
 
+#include <dfb/comm/progress.hpp>
 #include <dfb/error.hpp>
 
 #include <mpi.h>
@@ -135,12 +136,17 @@ private:
     std::chrono::microseconds next_ = shortest;
 };
 
-// Waits until the request has completed. Throws as checkMpi() does.
+// Waits until the request has completed, and meanwhile polls as ProgressThread::pollOthers() does. Throws as checkMpi()
+// does.
 inline void waitMpi(MPI_Request& request, int rank, MPI_Status* status = MPI_STATUS_IGNORE)
 {
     int done = 0;
-    for (Backoff backoff; checkMpi(MPI_Test(&request, &done, status), "MPI_Test", rank), !done;)
-        backoff.nap();
+    for (Backoff backoff; checkMpi(MPI_Test(&request, &done, status), "MPI_Test", rank), !done;) {
+        if (ProgressThread::pollOthers())
+            backoff.reset();
+        else
+            backoff.nap();
+    }
 }
 
 } // namespace detail

@@ -1,6 +1,7 @@
 // ProgressThread: calls poll() of a link so that messages move while the renderer works. It polls for a few
 // microseconds after the last message, then naps. Naps are longer if fewer messages come, and shorter while a thread
-// waits. Between polls it calls a function for work that is due at certain times, such as the heartbeat.
+// waits. Between polls it calls a function for work that is due at certain times, such as the heartbeat. Where there
+// may be no thread, threads that wait poll the link: see leaveToCallers().
 #pragma once
 
 #include <dfb/comm/transport.hpp>
@@ -12,6 +13,7 @@
 #include <mutex>
 #include <thread>
 #include <utility>
+#include <vector>
 
 #if defined(__linux__)
 #include <sys/prctl.h>
@@ -38,9 +40,44 @@ public:
         thread_ = std::thread([this] { run(); });
     }
 
-    // Ends the thread: after this it does not call poll() any more. The other members may still be called.
+    // In place of start(), if only the calling thread may poll: from now on pollOthers() polls this link, too.
+    void leaveToCallers()
+    {
+        const std::lock_guard<std::mutex> lock(left().mutex);
+        maker_ = std::this_thread::get_id();
+        left().all.push_back(this);
+    }
+
+    // For a thread that waits: polls the links that it has left to callers, but not that of `own`. A rank that waits
+    // with one connection may be needed in another. Returns whether anything moved.
+    static bool pollOthers(const ProgressThread* own = nullptr)
+    {
+        static thread_local bool isPolling = false; // a link that is polled does not poll others
+        if (isPolling)
+            return false;
+        const std::unique_lock<std::mutex> lock(left().mutex, std::try_to_lock);
+        if (!lock.owns_lock())
+            return false;
+        isPolling = true;
+        bool moved = false;
+        try {
+            for (ProgressThread* each : left().all)
+                moved = (each != own && each->maker_ == std::this_thread::get_id() && each->link_.mayPoll()
+                         && each->tryPoll())
+                        || moved;
+        } catch (const std::exception&) { // of a transport that throws: its own callers will see it
+        }
+        isPolling = false;
+        return moved;
+    }
+
+    // Ends the thread: after this neither it nor pollOthers() calls poll(). The other members may still be called.
     void stop()
     {
+        {
+            const std::lock_guard<std::mutex> lock(left().mutex);
+            left().all.erase(std::remove(left().all.begin(), left().all.end(), this), left().all.end());
+        }
         stop_ = true;
         link_.interrupt();
         if (thread_.joinable())
@@ -96,6 +133,16 @@ public:
 private:
     static constexpr std::chrono::microseconds pollTime{5};
 
+    struct Left { // to callers, in this process. Where ranks are threads, each polls only its own.
+        std::mutex mutex;
+        std::vector<ProgressThread*> all; // under mutex
+    };
+    static Left& left()
+    {
+        static Left& links = *new Left; // never destroyed: connections may be, after it
+        return links;
+    }
+
     // Waking up costs rendering threads some 10 us of a core. While no thread waits here, a message may be taken a
     // little later. A message that this rank sends ends the nap anyway.
     Clock::duration napAfter(Clock::duration idle, bool quiet) const
@@ -133,6 +180,7 @@ private:
     Link& link_;
     const Clock::duration longestNap_;
     const std::function<void(Clock::time_point)> between_;
+    std::thread::id maker_; // that of leaveToCallers()
     std::mutex pollMutex_;
     std::atomic<bool> stop_{false};
     std::atomic<bool> hasPolled_{false}; // since `between` was called

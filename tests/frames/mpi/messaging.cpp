@@ -263,6 +263,12 @@ TEST_CASE("Two framebuffers with connections of their own, whose messages only w
         CHECK(outcomeOf([&] { frameA.end(); }) == "fine");
         CHECK(outcomeOf([&] { frameB.end(); }) == "fine");
     }
+    // A rank that waits in a constructor is needed by those that still wait for room.
+    config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+    Fb c(MPI_COMM_WORLD, config, network);
+    auto frame = dfb::DataParallelLoop(c, world).start(camera, draw, params);
+    const Fb made(MPI_COMM_WORLD, config, network);
+    CHECK(outcomeOf([&] { frame.end(); }) == "fine");
 }
 
 TEST_CASE("Messages that come twice are dropped and counted", "[messaging]")
