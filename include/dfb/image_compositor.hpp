@@ -184,9 +184,8 @@ private:
     std::vector<TileInput> inputs_;
     // Used only if ranks are on several nodes:
     std::optional<detail::LinkOwners> owners_;
-    // Of each rank's image in the last picture, as detail::PackedRegion has it; -1: it had none.
-    std::vector<double> regions_, nextRegions_;
-    TileOwners regionOwners_; // by regions_; null: not found yet
+    std::vector<Region> regions_, nextRegions_; // of each rank's image in the last picture; empty: it had none
+    TileOwners regionOwners_;                   // by regions_; null: not found yet
 };
 
 DFB_NAMESPACE_END
@@ -225,32 +224,22 @@ std::unique_ptr<Operations> imageOperations(const char* name, const ImageConfig&
     return std::make_unique<OperationsOf<TileOp, NoPixelOp>>(NoPixelOp(), std::move(traits));
 }
 
-// Packs a region of a picture into a number that a double holds exactly: 13 bits for each side.
-class PackedRegion {
-public:
-    explicit PackedRegion(const TileLayout& layout) : step_((std::max(layout.width(), layout.height()) - 1) / 8191 + 1)
-    {
-    }
-
-    double pack(const Region& r) const
-    {
-        std::uint64_t bits = 0;
-        for (const int side : {r.x0 / step_, r.y0 / step_, (r.x1 - 1) / step_ + 1, (r.y1 - 1) / step_ + 1})
-            bits = bits << 13 | static_cast<std::uint64_t>(side);
-        return static_cast<double>(bits);
-    }
-    Region unpack(double number) const
-    {
-        if (!(number >= 0 && number < double(std::uint64_t{1} << 52))) // a message can be damaged
-            return {};
-        const auto bits = static_cast<std::uint64_t>(number);
-        const auto side = [&](int shift) { return step_ * static_cast<int>(bits >> shift & 8191); };
-        return {side(39), side(26), side(13), side(0)};
-    }
-
-private:
-    int step_; // pixels
-};
+// A rank's region of the picture as a Figure, which all ranks get with the verdict: the key has the rank and the upper
+// left pixel, the value the lower right one.
+inline Figure figureOf(int rank, const Region& r)
+{
+    return {static_cast<std::uint64_t>(rank) << 32 | static_cast<std::uint32_t>(r.x0) << 16
+                | static_cast<std::uint32_t>(r.y0),
+            65536.0 * (r.x1 - 1) + (r.y1 - 1)};
+}
+inline Region regionOf(const Figure& figure)
+{
+    if (!(figure.value >= 0 && figure.value < 0x1p32)) // a message can be damaged
+        return {};
+    const auto first = static_cast<std::uint32_t>(figure.key), last = static_cast<std::uint32_t>(figure.value);
+    const auto low = [](std::uint32_t bits) { return static_cast<int>(bits & 0xffff); };
+    return {low(first >> 16), low(first), low(last >> 16) + 1, low(last) + 1};
+}
 
 // The part of an input image that is in one tile, as a view of pixels that a framebuffer takes.
 class InputTile {
@@ -402,11 +391,10 @@ DFB_COMPILED_ONCE TileOwners ImageCompositor::findOwners()
     if (regionOwners_)
         return regionOwners_;
     const TileLayout& layout = engine_->layout();
-    const detail::PackedRegion packed(layout);
     owners_->start(layout);
     for (const std::vector<int>& ranks : owners_->byNode())
         for (const int rank : ranks)
-            detail::forEachTile(packed.unpack(regions_[static_cast<std::size_t>(rank)]), layout,
+            detail::forEachTile(regions_[static_cast<std::size_t>(rank)], layout,
                                 [&](int tile, const Region& pixels) { owners_->add(tile, pixels, rank); });
     regionOwners_ =
         owners_->find(config(), blend_ != ImageBlend::InOrder, [this](int tile) { return engine_->tileOwner(tile); });
@@ -490,10 +478,10 @@ DFB_COMPILED_ONCE FrameReport ImageCompositor::end()
     engine_->requireProgress();
     FrameReport report = engine_->end();
     const std::vector<Figure> figures = std::exchange(report.figures, {});
-    nextRegions_.assign(figures.empty() ? 0 : static_cast<std::size_t>(size()), -1);
+    nextRegions_.assign(figures.empty() ? 0 : static_cast<std::size_t>(size()), {});
     for (const Figure& figure : figures)
-        if (figure.key < nextRegions_.size()) // a message can be damaged
-            nextRegions_[figure.key] = figure.value;
+        if (const std::uint64_t rank = figure.key >> 32; rank < nextRegions_.size()) // a message can be damaged
+            nextRegions_[rank] = detail::regionOf(figure);
     if (nextRegions_ != regions_) {
         regions_.swap(nextRegions_);
         regionOwners_ = nullptr;
@@ -538,8 +526,10 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place)
         detail::forEachTile(part.valid(), layout, [&](int tile, const Region&) {
             inputs_.push_back({tile, source, 0});
         });
-    if (!inputs_.empty() && !owners_->isOneNode())
-        engine_->addFigure(static_cast<std::uint64_t>(rank()), detail::PackedRegion(layout).pack(part.valid()));
+    if (!inputs_.empty() && !owners_->isOneNode()) {
+        const Figure figure = detail::figureOf(rank(), part.valid());
+        engine_->addFigure(figure.key, figure.value);
+    }
     engine_->declare(inputs_);
     const auto sendTile = [&](std::size_t i) {
         if (engine_->failed())
