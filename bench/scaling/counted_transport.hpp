@@ -70,7 +70,7 @@ public:
 
 private:
     mutable std::mutex mutex_;
-    std::array<MessageCount, static_cast<std::size_t>(Kind::Leaving) + 1> counts_{};
+    std::array<MessageCount, static_cast<std::size_t>(Kind::End)> counts_{};
 };
 
 // Shared by the counted ranks: their traffic, and a place to meet without messages.

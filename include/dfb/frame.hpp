@@ -168,7 +168,7 @@ struct Figure {
     double value = 0;
 };
 
-// The figures of a finished frame that are sums over all ranks.
+// The figures of a finished frame that are sums over all ranks. All are std::int64_t: a verdict adds them as such.
 struct FrameSums {
     // Bytes of messages to other ranks, without the transport's own headers, plus the bytes that owners wrote directly
     // into the display rank's image.

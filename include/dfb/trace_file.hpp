@@ -217,7 +217,7 @@ private:
             "finished tiles", "tiles done",     "abort",       "ask",      "credit",
             "ask for jobs",   "jobs",           "image place", "failure",  "ping",
             "pong",           "hidden",         "tile lost",   "leaving"};
-        static_assert(static_cast<std::size_t>(MessageKind::Leaving) + 1 == names.size());
+        static_assert(static_cast<std::size_t>(MessageKind::End) == names.size());
         return names[std::min<std::size_t>(e.message, names.size() - 1)];
     }
     static std::string nameOf(const TraceEvent& e)

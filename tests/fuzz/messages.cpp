@@ -60,7 +60,7 @@ struct Way {
 // waits and no other message comes, such as an answer.
 enum How : std::uint8_t { NextFrame = 1, LastFrame = 2, OtherHeader = 3, numbered = 3, ToAnother = 4, Awaited = 8 };
 constexpr std::uint8_t kinds = 31, endOfFrame = 31; // takes the place of a kind
-static_assert(static_cast<int>(MessageKind::Leaving) < endOfFrame);
+static_assert(static_cast<int>(MessageKind::End) <= endOfFrame);
 
 // Runs tasks in submit(), but never while a message is delivered, as locks are held then.
 class TaskList final : public dfb::Executor {

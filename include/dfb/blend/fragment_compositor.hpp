@@ -160,7 +160,8 @@ private:
     // not copied. Returns false if the row must be composited otherwise.
     bool compositeInPlace(CompositeRow& row)
     {
-        if (rule_ == BlendRule::Nearest || row.wantsDepth || !row.rgbaLow.empty() || !detail::cpuHasAvx2())
+        const bool isBlended = rule_ == BlendRule::SortByDepth || rule_ == BlendRule::InOrder;
+        if (!isBlended || row.wantsDepth || !row.rgbaLow.empty() || !detail::cpuHasAvx2())
             return false;
         if (!findInPlace() || !(row.minTransmittance > 0 ? blendInPlace<true>(row) : blendInPlace<false>(row)))
             return false;

@@ -123,12 +123,13 @@ enum class MessageKind : std::uint8_t {
     Pong,          // the sender is there, and answers whenever it is asked
     Hidden,        // from which generation on inputs of a tile cannot be seen
     TileLost,      // the sender's renderer has failed in a tile of this owner, in a frame that may be partial
-    Leaving        // the sender destroys its object, and takes part in nothing that begins from now on
+    Leaving,       // the sender destroys its object, and takes part in nothing that begins from now on
+    End            // no kind
 };
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb, magicSwapped = 0xfb0d;
-    static constexpr std::uint8_t formatVersion = 15;
+    static constexpr std::uint8_t formatVersion = 15; // raise it when a header, a body or the meaning of a kind changes
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;
@@ -199,7 +200,7 @@ inline MessageHeader readMessageHeader(const Buffer& message)
     if (header.version != MessageHeader::formatVersion)
         failMalformed("the sender was built with another version of dfb, or of its wire format",
                       MessageHeader::formatVersion, header.version);
-    if (header.kind > MessageKind::Leaving)
+    if (header.kind >= MessageKind::End)
         failMalformed("unknown kind of message", -1, static_cast<std::int64_t>(header.kind));
     return header;
 }
@@ -264,7 +265,7 @@ public:
     }
 
 private:
-    static constexpr std::size_t most = 256; // a verdict without an error or figures has 221
+    static constexpr std::size_t most = 256; // more than a verdict without an error or figures has
 
     std::size_t fewCount_ = 0;
     std::array<std::byte, most> few_{};

@@ -541,26 +541,49 @@ private:
     // Passes a message to the object that handles its kind.
     void handle(int source, const MessageHeader& header, Buffer&& message)
     {
-        const MessageKind kind = header.kind;
         if (mailbox_->receiveCredit(source, header, message))
             return outcome_->tryVote(); // the vote may have waited for this credit
-        if (kind == MessageKind::Abort)
-            return outcome_->receiveAbort(header, message);
-        if (kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown)
-            return outcome_->receiveReduction(source, header, message);
         FinalGather& gather = pipeline_->gather();
-        if (kind == MessageKind::ImagePlace) {
-            gather.receivePlaces(source, bodyOf<ImagePlaces>(message), [&](std::int32_t place, std::size_t byteCount) {
-                return mailbox_->connection().blockAt(source, place, byteCount);
-            });
-            return;
-        }
-        if (outcome_->failed() && !(params_.allowPartial && FinalGather::isFinishedTile(kind)))
-            return;
-        if (FinalGather::isFinishedTile(kind)) {
+        switch (header.kind) {
+        case MessageKind::Abort: return outcome_->receiveAbort(header, message);
+        case MessageKind::ReduceUp:
+        case MessageKind::ReduceDown: return outcome_->receiveReduction(source, header, message);
+        case MessageKind::ImagePlace:
+            return gather.receivePlaces(source, bodyOf<ImagePlaces>(message),
+                                        [&](std::int32_t place, std::size_t byteCount) {
+                                            return mailbox_->connection().blockAt(source, place, byteCount);
+                                        });
+        case MessageKind::FinishedTiles:
+        case MessageKind::TilesDone:
+            if (outcome_->failed() && !params_.allowPartial)
+                return;
             gather.receive(source, header, std::move(message));
-            outcome_->tryVote();
-        } else if (kind == MessageKind::Fragment) {
+            return outcome_->tryVote();
+        case MessageKind::Fragment:
+        case MessageKind::Manifest:
+        case MessageKind::ManifestAck:
+        case MessageKind::Hidden:
+        case MessageKind::TileLost:
+        case MessageKind::JobRequest:
+        case MessageKind::Jobs:
+            if (!outcome_->failed())
+                handleInput(source, header, std::move(message));
+            return;
+        case MessageKind::CreditRequest:
+        case MessageKind::Credit:
+        case MessageKind::Failure:
+        case MessageKind::Ping:
+        case MessageKind::Pong:
+        case MessageKind::Leaving:
+        case MessageKind::End: failMalformed("a message that is not for a frame", -1, std::int64_t(header.kind));
+        }
+    }
+
+    // As handle(), for messages about inputs and jobs.
+    void handleInput(int source, const MessageHeader& header, Buffer&& message)
+    {
+        const MessageKind kind = header.kind;
+        if (kind == MessageKind::Fragment) {
             arrive(std::move(message), source);
         } else if (kind == MessageKind::Hidden) {
             const auto body = bodyOf<HiddenTiles::Message>(message);

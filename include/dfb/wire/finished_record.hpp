@@ -175,12 +175,13 @@ private:
         std::uint8_t differs[64] = {};
         for (std::size_t c = 0; c < channelCount; ++c) {
             const std::byte* plane = from.planes.at[c];
-            if (pixelBytes(c) == 16)
-                findDifferent<16>(plane, first, filler, count, differs);
-            else if (pixelBytes(c) == 12)
-                findDifferent<12>(plane, first, filler, count, differs);
-            else if (pixelBytes(c) == 4)
-                findDifferent<4>(plane, first, filler, count, differs);
+            switch (pixelBytes(c)) {
+            case 16: findDifferent<16>(plane, first, filler, count, differs); break;
+            case 12: findDifferent<12>(plane, first, filler, count, differs); break;
+            case 4: findDifferent<4>(plane, first, filler, count, differs); break;
+            case 0: break;
+            default: std::fill_n(differs, count, std::uint8_t{1}); // equal or not
+            }
         }
         std::uint64_t bits = 0;
         for (int i = 0; i < count; ++i)
