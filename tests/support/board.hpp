@@ -39,6 +39,7 @@ struct Board {
     // Called after a message has been passed on.
     std::function<void(int from, int to, const MessageHeader&)> passed;
 
+    std::atomic<std::int64_t> sent{0}; // messages
     std::mutex mutex;
     std::vector<std::function<void()>> held;
     bool released = false;
@@ -111,6 +112,7 @@ public:
     }
     void send(int to, dfb::Buffer&& message)
     {
+        ++board_->sent;
         const auto header = dfb::detail::loadAs<MessageHeader>(message.data());
         const auto what = board_->inspect ? board_->inspect(rank(), to, header, message) : Board::What::Pass;
         if (what == Board::What::Lose) {

@@ -2,7 +2,6 @@
 // hangs, and the next frame is right. Ranks are threads.
 #include "board.hpp"
 #include "catch.hpp"
-#include "forward.hpp"
 #include "random_scene.hpp"
 
 #include <dfb/testing/fault_transport.hpp>
@@ -35,6 +34,7 @@ namespace errors_cases {
 namespace {
 
 using board::allSame;
+using board::Board;
 using board::joined;
 using scene::has;
 using scene::Loop;
@@ -42,63 +42,11 @@ using scene::outcomeOf;
 using scene::Picture;
 using scene::Scene;
 
-// A transport whose messages a test can inspect, change and hold back.
-struct Switchboard {
-    enum class Verdict { Pass, Hold };
-    // Called for each message to another rank, from any thread.
-    std::function<Verdict(int from, int to, const dfb::detail::MessageHeader&, dfb::Buffer&)> inspect;
-    std::atomic<std::int64_t> sent{0};
-
-    std::mutex mutex;
-    std::vector<std::function<void()>> held;
-
-    void release()
-    {
-        std::vector<std::function<void()>> all;
-        {
-            const std::lock_guard<std::mutex> lock(mutex);
-            all.swap(held);
-        }
-        for (const auto& send : all)
-            send();
-    }
-};
-
-class InspectedTransport : public Forward<dfb::InprocTransport> {
-public:
-    struct Communicator {
-        dfb::InprocCommunicator inner;
-        std::shared_ptr<Switchboard> board;
-    };
-
-    InspectedTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
-        : Forward(c.inner, std::move(pool), progress), board_(c.board)
-    {
-    }
-    void send(int destination, dfb::Buffer&& message)
-    {
-        ++board_->sent;
-        if (board_->inspect) {
-            const auto header = dfb::detail::loadAs<dfb::detail::MessageHeader>(message.data());
-            if (board_->inspect(rank(), destination, header, message) == Switchboard::Verdict::Hold) {
-                const auto kept = std::make_shared<dfb::Buffer>(std::move(message));
-                const std::lock_guard<std::mutex> lock(board_->mutex);
-                board_->held.push_back([this, destination, kept] { inner_.send(destination, std::move(*kept)); });
-                return;
-            }
-        }
-        inner_.send(destination, std::move(message));
-    }
-
-private:
-    std::shared_ptr<Switchboard> board_;
-};
-
 using Blend = dfb::BasicAlphaBlend<16>;
 template <class TileOp, class PixelOp = dfb::NoPixelOp>
 using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, dfb::InprocTransport>;
 template <class TileOp>
-using InspectedFrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, InspectedTransport>;
+using InspectedFrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, board::BoardTransport>;
 
 // The errors of each rank in a bad frame, and the number of wrong values in the good frame after it.
 struct BadFrame {
@@ -243,12 +191,12 @@ TEST_CASE("A tile that cannot be right is refused at once, and nothing is sent",
     std::int64_t sentMeanwhile = -1;
     std::size_t wrong = 1;
     std::promise<void> over;
-    const auto board = std::make_shared<Switchboard>();
+    const auto board = std::make_shared<Board>();
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         auto config = configOf(s);
         config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
         using Fb = InspectedFrameBuffer<Blend>;
-        Fb fb({communicator, board}, config);
+        Fb fb({{communicator, std::nullopt}, board}, config);
         // Rank 0 begins the frame only when the bad calls are over, so any message sent until then comes from them.
         fb.allReduce({0}, Fb::Reduce::Sum);
         if (fb.rank() == 0)
@@ -1030,7 +978,7 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
 {
     // The input is one too many and is held back until its owner has voted. It is an error on all ranks, and counted as
     // late.
-    const auto board = std::make_shared<Switchboard>();
+    const auto board = std::make_shared<Board>();
     std::promise<void> ownerVoted, mayBegin;
     const auto mayBeginFuture = mayBegin.get_future().share();
     std::atomic<bool> inFrame{false};
@@ -1041,7 +989,7 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
         const bool extra =
             header.kind == dfb::detail::MessageKind::Fragment && header.number == 1
             && dfb::detail::loadAs<dfb::detail::FragmentHeader>(message.data() + sizeof header).source == 99;
-        return from == 1 && extra ? Switchboard::Verdict::Hold : Switchboard::Verdict::Pass;
+        return from == 1 && extra ? Board::What::Hold : Board::What::Pass;
     };
     const Scene s = scene::makeScene(0, 1, 16, 16);
     std::vector<std::string> texts(3);
@@ -1051,7 +999,7 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
         auto config = configOf(s);
         config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 2; };
         config.image.format = dfb::OutputFormat::None;
-        Fb fb({communicator, board}, config);
+        Fb fb({{communicator, std::nullopt}, board}, config);
         const auto rank = static_cast<std::size_t>(fb.rank());
         fb.allReduce({0}, Fb::Reduce::Sum);
         if (fb.rank() == 1) {
@@ -1092,7 +1040,7 @@ namespace {
 template <class TileOp>
 std::vector<std::string> withInputTooMany(bool allowPartial)
 {
-    const auto board = std::make_shared<Switchboard>();
+    const auto board = std::make_shared<Board>();
     board->inspect = [&](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer& message) {
         if (from == 0 && header.kind == dfb::detail::MessageKind::ReduceDown && header.number == 1
             && dfb::detail::loadAs<std::uint32_t>(message.data() + sizeof header) != 0) // the verdict
@@ -1100,7 +1048,7 @@ std::vector<std::string> withInputTooMany(bool allowPartial)
         const bool announced =
             header.kind == dfb::detail::MessageKind::Fragment
             && dfb::detail::loadAs<dfb::detail::FragmentHeader>(message.data() + sizeof header).source == 7;
-        return announced ? Switchboard::Verdict::Hold : Switchboard::Verdict::Pass;
+        return announced ? Board::What::Hold : Board::What::Pass;
     };
     const Scene s = scene::makeScene(0, 1, 16, 16);
     std::vector<std::string> texts(2);
@@ -1109,7 +1057,7 @@ std::vector<std::string> withInputTooMany(bool allowPartial)
         auto config = configOf(s);
         config.image.depth = false;
         config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
-        Fb fb({communicator, board}, config);
+        Fb fb({{communicator, std::nullopt}, board}, config);
         texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
             dfb::FrameConfig params;
             params.timeout = std::chrono::milliseconds(20000);
@@ -1306,18 +1254,18 @@ TEST_CASE("end() without declare() fails the frame on every rank", "[errors]")
 TEST_CASE("A broken message fails the frame on every rank and names its sender", "[errors]")
 {
     const Scene s = scene::makeScene(6);
-    const auto board = std::make_shared<Switchboard>();
+    const auto board = std::make_shared<Board>();
     std::atomic<bool> done{false};
     board->inspect = [&](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer& message) {
         // The first input from rank 2 loses its last byte.
         if (from == 2 && header.kind == dfb::detail::MessageKind::Fragment && !done.exchange(true))
             message.shrink(message.size() - 1);
-        return Switchboard::Verdict::Pass;
+        return Board::What::Pass;
     };
     std::vector<std::string> texts(3);
     std::size_t wrong = 1;
     dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
-        InspectedFrameBuffer<Blend> fb({communicator, board}, configOf(s));
+        InspectedFrameBuffer<Blend> fb({{communicator, std::nullopt}, board}, configOf(s));
         texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); });
         const auto report = scene::renderLoop(fb, s, Loop::Declared);
         if (fb.isDisplayRank())
@@ -1335,11 +1283,11 @@ TEST_CASE("Messages of a frame that is over are counted and do no harm", "[error
 {
     for (const bool cancels : {false, true}) {
         const Scene s = scene::makeScene(0, 1, 97, 61);
-        const auto board = std::make_shared<Switchboard>();
+        const auto board = std::make_shared<Board>();
         board->inspect = [](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer&) {
             return from == 1 && header.kind == dfb::detail::MessageKind::Fragment && header.number == 1
-                       ? Switchboard::Verdict::Hold
-                       : Switchboard::Verdict::Pass;
+                       ? Board::What::Hold
+                       : Board::What::Pass;
         };
         std::string first;
         std::vector<std::int64_t> late;
@@ -1348,7 +1296,7 @@ TEST_CASE("Messages of a frame that is over are counted and do no harm", "[error
             using Fb = InspectedFrameBuffer<Blend>;
             auto config = configOf(s);
             config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-            Fb fb({communicator, board}, config);
+            Fb fb({{communicator, std::nullopt}, board}, config);
             auto tile = std::make_unique<Fb::Tile>();
             const auto setAll = [&](Fb::Frame& frame) {
                 for (int index = 0; index < 28; ++index)
