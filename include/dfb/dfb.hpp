@@ -1,5 +1,6 @@
-// All of dfb, except dfb/trace_file.hpp. MPI, oneTBB and Snappy are included if DFB_HAS_MPI, DFB_HAS_TBB and
-// DFB_HAS_SNAPPY are defined. The CMake targets dfb::mpi, dfb::tbb and dfb::snappy define them; see also version.hpp.
+// All that most programs need; dfb/trace_file.hpp and parts of dfb/blend/ are left out. MPI, oneTBB and Snappy are
+// included if DFB_HAS_MPI, DFB_HAS_TBB and DFB_HAS_SNAPPY are defined. The CMake targets dfb::mpi, dfb::tbb and
+// dfb::snappy define them; see also version.hpp.
 #pragma once
 
 #include <dfb/comm/inproc_transport.hpp>

@@ -20,7 +20,7 @@ class Codec {
 public:
     virtual ~Codec() = default;
 
-    // The codec's number in messages, not 0. A number must mean one format on all ranks.
+    // The codec's number in messages, not 0; that of SnappyCodec is 1. A number must mean one format on all ranks.
     virtual std::uint8_t id() const noexcept = 0;
     // The most that compress() writes for `byteCount` bytes.
     virtual std::size_t bound(std::size_t byteCount) const = 0;
@@ -148,7 +148,7 @@ public:
     // Whether messages of this frame may be compressed.
     bool isOn() const { return codec_ && (mode_ == CompressionMode::Always || trial_.compresses()); }
 
-    // Whether that rank is not left alone in this frame. There must be a codec.
+    // Whether messages to that rank are worth compressing in this frame. There must be a codec.
     bool isWorthwhile(int other) const { return peers_[static_cast<std::size_t>(other)].pause == 0; }
 
     // Returns the codec for messages with pixels to another rank in this frame, or null for none. `isNear`: that rank

@@ -116,7 +116,7 @@ public:
     // Begins an epoch and counts credit anew; see FlowControl. No task may be handling a message with credit.
     void newEpoch(std::int64_t number)
     {
-        sentOn_ = takenOn_ = 0;
+        workSent_ = workTaken_ = 0;
         bytesSent_ = messagesSent_ = 0;
         flow_.newEpoch();
         enterEpoch(number);
@@ -142,15 +142,15 @@ public:
         // Counts it now, so that the figures of the frame include it even if it has to wait.
         bytesSent_ += static_cast<std::int64_t>(message.size());
         ++messagesSent_;
-        const bool isOn = carriesOn(header.kind, message);
-        sentOn_ += isOn;
+        const bool isCounted = isWork(header.kind, message);
+        workSent_ += isCounted;
         try {
             if (needsCredit(header.kind))
                 flow_.send(destination, std::move(message));
             else
                 pass(destination, std::move(message));
         } catch (...) { // no rank will take it
-            sentOn_ -= isOn;
+            workSent_ -= isCounted;
             throw;
         }
     }
@@ -220,8 +220,8 @@ public:
     // Counts a message of the epoch as taken.
     void countTaken(int source, const MessageHeader& header, const Buffer& message)
     {
-        if (source != rank() && carriesOn(header.kind, message))
-            ++takenOn_;
+        if (source != rank() && isWork(header.kind, message))
+            ++workTaken_;
     }
 
     // Returns how many messages of the epoch this rank has sent and taken; only those count that make their receiver do
@@ -229,13 +229,13 @@ public:
     // sent.
     std::optional<Quiescence::Report> countsAtRest()
     {
-        const Quiescence::Report counts{sentOn_, takenOn_};
+        const Quiescence::Report counts{workSent_, workTaken_};
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             if (tasks_ > 0)
                 return std::nullopt;
         }
-        if (!flow_.allSent() || !connection_->quiet() || counts.sent != sentOn_ || counts.taken != takenOn_)
+        if (!flow_.allSent() || !connection_->quiet() || counts.sent != workSent_ || counts.taken != workTaken_)
             return std::nullopt;
         return counts; // they are the same before and after the check for tasks
     }
@@ -621,7 +621,7 @@ private:
 
     // Whether a message makes its receiver do something for its frame. Credit does not: it only releases waiting
     // messages, which are counted themselves.
-    static bool carriesOn(MessageKind kind, const Buffer& message)
+    static bool isWork(MessageKind kind, const Buffer& message)
     {
         switch (kind) {
         case MessageKind::Credit:
@@ -771,8 +771,8 @@ private:
     FlowControl flow_;
     ReductionTable reductions_;
     std::atomic<std::int64_t> bytesSent_{0}, messagesSent_{0};
-    std::atomic<std::uint64_t> sentOn_{0}, takenOn_{0}; // see countsAtRest()
-    std::atomic<std::int64_t> reductionCount_{0};       // calls of reduce() so far
+    std::atomic<std::uint64_t> workSent_{0}, workTaken_{0}; // see countsAtRest()
+    std::atomic<std::int64_t> reductionCount_{0};           // calls of reduce() so far
     std::mutex damageMutex_;
     std::optional<ErrorInfo> damage_; // under damageMutex_
 

@@ -37,9 +37,9 @@ public:
         else if (any_)
             for (Tile& tile : tiles_) {
                 tile.from = none;
-                tile.open.clear();
+                tile.undecided.clear();
             }
-        any_ = anyOpen_ = false;
+        any_ = anyUndecided_ = false;
     }
 
     void take(const Message& message)
@@ -50,11 +50,11 @@ public:
         if (message.word == Word::Hides)
             tile.from = std::min(tile.from.load(), message.generation);
         if (message.word == Word::MayHide)
-            anyOpen_ = true;
-        auto at = std::find_if(tile.open.begin(), tile.open.end(),
-                               [&](const Open& o) { return o.generation == message.generation; });
-        if (at == tile.open.end())
-            at = tile.open.insert(at, {message.generation, 0});
+            anyUndecided_ = true;
+        auto at = std::find_if(tile.undecided.begin(), tile.undecided.end(),
+                               [&](const Undecided& u) { return u.generation == message.generation; });
+        if (at == tile.undecided.end())
+            at = tile.undecided.insert(at, {message.generation, 0});
         at->count += message.word == Word::MayHide ? 1 : -1; // the words may overtake each other
     }
 
@@ -64,26 +64,26 @@ public:
     // Whether a word is still to come that may hide an input which is not hidden yet.
     bool isUndecided(int tile, int generation) const
     {
-        if (!anyOpen_ || generation >= from(tile))
+        if (!anyUndecided_ || generation >= from(tile))
             return false;
         const std::lock_guard<std::mutex> lock(mutex_);
-        const auto& open = tiles_[static_cast<std::size_t>(tile)].open;
-        return std::any_of(open.begin(), open.end(),
-                           [&](const Open& o) { return o.count > 0 && o.generation <= generation; });
+        const auto& all = tiles_[static_cast<std::size_t>(tile)].undecided;
+        return std::any_of(all.begin(), all.end(),
+                           [&](const Undecided& u) { return u.count > 0 && u.generation <= generation; });
     }
 
 private:
-    struct Open {
+    struct Undecided { // inputs that words are still to come about
         std::int32_t generation;
         int count;
     };
     static constexpr std::int32_t none = std::numeric_limits<std::int32_t>::max();
     struct Tile {
         std::atomic<std::int32_t> from{none}; // the first generation that is hidden; set under mutex_
-        std::vector<Open> open;               // under mutex_
+        std::vector<Undecided> undecided;     // under mutex_
     };
     std::vector<Tile> tiles_;
-    std::atomic<bool> any_{false}, anyOpen_{false};
+    std::atomic<bool> any_{false}, anyUndecided_{false};
     mutable std::mutex mutex_;
 };
 

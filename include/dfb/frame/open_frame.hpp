@@ -1,7 +1,7 @@
 // OpenFrame: the frame that is open on this rank, as a state machine (drawn in docs/architecture.md). It knows which
 // messages and tasks belong to the frame, and what the frame still waits for.
 //
-// The thread that is in begin() or end() calls open(), finish() and close(). Any thread calls fail(). Any thread calls
+// The thread that is in begin() or end() calls open(), beginEnd() and close(). Any thread calls fail(). Any thread calls
 // vote() when it has done something that the vote may have waited for. The thread that takes the result of the vote
 // calls decide(). close() may be called in every state: if the transport has failed, no verdict comes.
 #pragma once
@@ -30,7 +30,7 @@ enum class FrameState : std::uint8_t {
     Decided    // all ranks have voted; work that is running may come to its end
 };
 
-// Any thread may call the members, except open(), finish() and close(): one thread at a time.
+// Any thread may call the members, except open(), beginEnd() and close(): one thread at a time.
 class OpenFrame {
 public:
     // Frames have the numbers `first`, `first` + `step`, and so on.
@@ -68,8 +68,8 @@ public:
         return opened_;
     }
 
-    // Called when end() has begun.
-    void finish()
+    // Called when end() begins: from now on this rank only waits.
+    void beginEnd()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (state_ == FrameState::Rendering)

@@ -218,7 +218,7 @@ public:
     // Called once a frame, when this rank has set its last tile: from now on it votes as soon as it can.
     void beginEnd()
     {
-        frame_.finish();
+        frame_.beginEnd();
         endedAt_ = Clock::now();
         nextLook_ = endedAt_ + quiescence_.interval();
         if (hasTimeout())
@@ -330,10 +330,10 @@ private:
     // Whether this rank has nothing left to do and only waits for other ranks.
     bool isDone() const { return frame_.areTilesFinished() && tiles_.table().isSaid() && tiles_.gather().complete(); }
 
-    // If only end() moves messages, all must have been taken before any rank may leave: a rank that polls no more takes
-    // nothing, and the sender would wait in end() for its message to go. In a frame that may be partial, a rank must
-    // not wait for credit after its vote either, as ranks that have left give none. But credit that may be lost must
-    // not hold up the vote: finished tiles then have the time of waitForFinishedTiles().
+    // A rank with a progress thread may vote before all of its messages have left. There are two exceptions. If only
+    // end() moves messages, all must have left: ranks that are out of end() take none. In a frame that may be partial,
+    // none may wait for credit, as ranks that are out of end() give none. But credit that may be lost does not hold up
+    // the vote: finished tiles then have the time of waitForFinishedTiles().
     bool mayVote() const
     {
         const bool onlyCallers = mailbox_.connection().hasOnlyCallers();

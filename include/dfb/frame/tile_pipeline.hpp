@@ -84,7 +84,7 @@ public:
     // tiles are compressed.
     void newFrame(std::int64_t frame, const FrameConfig& params, Accumulation::Start start, bool compresses)
     {
-        const FloatEnvironment floatEnvironment;
+        const FloatEnvironment floatEnvironment; // keeps denormals of the background
         faults_.reset();
         promises_.clear();
         errors_.clear();

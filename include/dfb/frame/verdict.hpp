@@ -57,7 +57,7 @@ inline bool isMissing(ErrorKind kind) noexcept
     return kind == ErrorKind::TimedOut || kind == ErrorKind::MissingInput;
 }
 
-// The fields of FrameConfig. Travels as it is with each verdict.
+// What must be equal in the FrameConfigs of all ranks; lists as hashes. Travels with each verdict, byte for byte.
 struct FrameTerms {
     std::uint64_t samplesHash = 0; // 0: there is no plan
     std::int64_t sampleCount = 0;  // of all tiles in the plan

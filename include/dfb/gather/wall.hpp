@@ -238,8 +238,8 @@ private:
         refuse(error.from, error, 0);
     }
 
-    // Notes that a part of some frame is missing: of the next one that ends, or of one that has begun. `frame`: the
-    // frame that the message names.
+    // Notes that a part of a frame is missing. It is not known of which one: finish() fails for all that have begun.
+    // `frame`: the frame that the message names.
     void refuse(int source, const ErrorInfo& error, std::int64_t frame)
     {
         {
