@@ -1,4 +1,5 @@
 """FrameBuffer: bricks rendered by a function, blended by the library or by a function, beside the reference."""
+import pickle
 import subprocess
 import sys
 import time
@@ -7,7 +8,7 @@ import unittest
 import numpy as np
 
 import dfb
-from support import assert_exact, blended, nearest
+from support import assert_exact, blended, error_of, nearest
 
 WIDTH, HEIGHT, BRICKS = 200, 130, 5
 CAMERA = dfb.PerspectiveCamera((0.5, 0.4, 7), (0, 0, 0), (0, 1, 0), 40)
@@ -181,7 +182,7 @@ with dfb.FrameBuffer(None, 64, 64) as left:
         self.assertEqual(len(tiles), 12)
 
     def test_cameras(self):
-        """Matrices, orthographic and perspective, in rows."""
+        """Matrices, orthographic and perspective, in rows; and cameras that have been sent to another process."""
         def coverage(brick, tile):
             tile.rgba[...] = 1
             tile.depth[...] = 1
@@ -200,8 +201,12 @@ with dfb.FrameBuffer(None, 64, 64) as left:
             def function(brick, tile):
                 coverage(brick, tile)
                 rays.append((camera.rays(tile), tile.x0, tile.y0))
+                np.testing.assert_array_equal(pickle.loads(pickle.dumps(camera)).rays(tile), camera.rays(tile))
             return function
 
+        self.assertEqual(pickle.loads(pickle.dumps(CAMERA)).eye, CAMERA.eye)
+        empty = dfb.PerspectiveCamera.__new__(dfb.PerspectiveCamera)
+        self.assertRegex(str(error_of(lambda: empty.__setstate__(b"old"))), "another version of dfb")
         for camera in (orthographic, perspective):
             rays.clear()
             with dfb.FrameBuffer(None, WIDTH, HEIGHT) as fb:

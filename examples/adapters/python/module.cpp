@@ -10,9 +10,13 @@
 #include <pybind11/stl.h>
 
 #include <array>
+#include <cstddef>
+#include <cstring>
 #include <exception>
 #include <memory>
 #include <string>
+#include <string_view>
+#include <type_traits>
 
 namespace py = pybind11;
 using namespace py::literals;
@@ -46,6 +50,23 @@ py::tuple eyeOf(const Camera& camera)
 {
     const dfb::Vec3 eye = camera.eye();
     return py::make_tuple(eye.x, eye.y, eye.z);
+}
+
+// Pickles a camera as its bytes: mpi4py then sends it to ranks that have the same build of this module.
+template <class Camera>
+auto pickled()
+{
+    static_assert(std::is_trivially_copyable_v<Camera>);
+    return py::pickle(
+        [](const Camera& camera) { return py::bytes(reinterpret_cast<const char*>(&camera), sizeof camera); },
+        [](const py::bytes& state) {
+            const std::string_view bytes = state;
+            if (bytes.size() != sizeof(Camera))
+                throw dfb::InvalidArgument("this camera was pickled by another version of dfb");
+            alignas(Camera) std::byte copy[sizeof(Camera)];
+            std::memcpy(copy, bytes.data(), bytes.size());
+            return *reinterpret_cast<const Camera*>(copy);
+        });
 }
 
 std::string reportText(const dfb::FrameReport& report)
@@ -165,6 +186,7 @@ PYBIND11_MODULE(_dfb, module)
              }),
              "eye"_a, "target"_a, "up"_a = Three{0, 1, 0}, "fov_y"_a = 45.0f,
              "fov_y: the vertical angle of view in degrees. Raises Error if no camera can be so.")
+        .def(pickled<dfb::PerspectiveCamera>())
         .def_property_readonly("eye", &eyeOf<dfb::PerspectiveCamera>, "Where all rays begin.")
         .def(
             "rays", &raysOf<dfb::PerspectiveCamera>, "tile"_a,
@@ -175,6 +197,7 @@ PYBIND11_MODULE(_dfb, module)
              "Matrices that are multiplied by a column, as in `projection @ view @ point`, with OpenGL's clip "
              "coordinates. Of OpenGL's or VTK's memory: the former lies in columns and has to be transposed, the "
              "latter lies in rows. Raises Error if they make no image.")
+        .def(pickled<dfb::MatrixCamera>())
         .def_property_readonly("orthographic", &dfb::MatrixCamera::isOrthographic,
                                "Whether all rays have one direction.")
         .def_property_readonly("eye", &eyeOf<dfb::MatrixCamera>, "Where all rays begin; of no use if orthographic.")
