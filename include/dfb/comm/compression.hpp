@@ -46,8 +46,9 @@ namespace detail {
 // the codec and the cores.
 //
 // Ranks that get the same times make the same choice. At first, frames with and without compression take turns. Then
-// the faster way is used. The other is tried again more and more seldom, and when frames have become much slower or
-// faster. If it seems faster by a tenth, both take turns again.
+// the faster way is used. The other is tried again more and more seldom, and when some frames, one after the other, are
+// much slower or faster than usual: more and more of them, as frames whose times vary need no trial. If it seems faster
+// by a tenth, both take turns again.
 class CompressionTrial {
 public:
     // Whether the next frame is to be compressed.
@@ -76,7 +77,7 @@ public:
 private:
     enum class Phase { Turns, Settled, Probe };
     static constexpr int turns = 4, probes = 2, firstInterval = 32, longestInterval = 512; // in frames
-    static constexpr std::size_t remembered = 7, surprise = 3;
+    static constexpr std::size_t remembered = 7, surprise = 3, longestPatience = 24;
 
     static double median(std::vector<double> times)
     {
@@ -107,8 +108,11 @@ private:
         if (mine.size() > remembered)
             mine.erase(mine.begin());
         strange_ = time > 1.5 * usual_ || time < usual_ / 1.5 ? strange_ + 1 : 0;
-        if (++frames_ < interval_ && strange_ < surprise)
+        const bool isStrange = strange_ >= patience_;
+        if (++frames_ < interval_ && !isStrange)
             return;
+        if (isStrange)
+            patience_ = std::min(2 * patience_, longestPatience);
         mine.erase(mine.begin(), mine.end() - static_cast<std::ptrdiff_t>(std::min(mine.size(), surprise)));
         mode_ = !mode_;
         times_[mode_].clear();
@@ -119,6 +123,7 @@ private:
     {
         if (median(times_[mode_]) < 0.9 * median(times_[!mode_])) { // or so it seems: compare again
             times_ = {};
+            patience_ = surprise;
             begin(Phase::Turns);
         } else {
             settle(!mode_, std::min(2 * interval_, longestInterval));
@@ -129,6 +134,7 @@ private:
     bool mode_ = false;
     int frames_ = -2; // in this phase; below 0: the first frames of all, whose times do not count
     int interval_ = firstInterval;
+    std::size_t patience_ = surprise;          // how many strange frames, one after the other, call for a trial
     std::size_t strange_ = 0;                  // frames, one after the other, that took an unusual time
     double usual_ = 0;                         // the median time when it was last found out
     std::array<std::vector<double>, 2> times_; // without, with

@@ -4,6 +4,7 @@
 #include <dfb/comm/compression.hpp>
 
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
@@ -135,6 +136,20 @@ TEST_CASE("Noise and slow frames do not turn it round", "[compression]")
             CHECK(right > 800);
         }
     }
+}
+
+TEST_CASE("Frames whose times vary much cost few trials", "[compression]")
+{
+    double total = 0;
+    for (unsigned seed = 1; seed <= 50; ++seed) {
+        std::mt19937 random(seed);
+        CompressionTrial trial;
+        // Half of the frames take 1.5 times the median or more, or less than 2/3 of it.
+        const auto jitter = [&] { return std::exp(1.2 * (static_cast<double>(random() % 1001) / 1000 - 0.5)); };
+        const Run r = run(trial, 1000, [&](bool compressed, int) { return (compressed ? 1.0 : 4.0) * jitter(); });
+        total += (r.compressed + 4.0 * (1000 - r.compressed)) / 1000; // 1: never the wrong way
+    }
+    CHECK(total / 50 < 1.1);
 }
 
 TEST_CASE("When the network becomes slow, or fast again, it is noticed soon", "[compression]")
