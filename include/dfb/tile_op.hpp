@@ -150,17 +150,19 @@ public:
     const detail::Planes& planes() const noexcept { return to_; }
     std::size_t stride() const noexcept { return stride_; } // from a row to the next, in pixels
 
-    // Replaces value i in [0, 4 * width()) of row y by another 8-bit level, after setRow(). Nobody checks these
+    // The 8-bit level of value i in [0, 4 * width()) of row y, after setRow(); and its replacement. Nobody checks these
     // numbers.
-    void setLevel(int y, int i, std::uint8_t level)
-    {
-        const std::size_t pixel = static_cast<std::size_t>(y) * stride_;
-        to_.at[detail::Color][4 * pixel + static_cast<std::size_t>(i)] = static_cast<std::byte>(level);
-    }
+    int level(int y, int i) const { return static_cast<int>(*levelAt(y, i)); }
+    void setLevel(int y, int i, std::uint8_t level) { *levelAt(y, i) = static_cast<std::byte>(level); }
 
 private:
     template <class Real>
     double convert(const Real* rgba, int count, std::byte* color) const;
+
+    std::byte* levelAt(int y, int i) const
+    {
+        return to_.at[detail::Color] + 4 * pixelAt(0, y) + static_cast<std::size_t>(i);
+    }
 
     std::size_t pixelAt(int x, int y) const
     {

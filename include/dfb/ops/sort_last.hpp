@@ -534,8 +534,13 @@ DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, dou
     for (int i = step - 1; i < 4 * out.width(); i += step) {
         const auto at = static_cast<std::size_t>(i);
         const DoubleDouble value = sum.empty() ? DoubleDouble{row.rgba[at], row.rgbaLow[at]} : sum[at] / info_.passes;
-        if (std::isfinite(value.high)) // twice the precision makes NaN of infinities
-            out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
+        if (!std::isfinite(value.high)) // twice the precision makes NaN of infinities
+            continue;
+        // A tie is between two neighbours. Where huge values cancel, double is nearly always off by more, also in rows
+        // without a tie.
+        const int level = out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value);
+        if (std::abs(level - out.level(y, i)) <= 1)
+            out.setLevel(y, i, static_cast<std::uint8_t>(level));
     }
 }
 

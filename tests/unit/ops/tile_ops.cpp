@@ -564,6 +564,9 @@ TEST_CASE("A tie in a row does not change the levels of other pixels", "[ops]")
     CHECK(levelBeside(0.5f, cut, 0.01f) == levelBeside(0.3f, cut, 0.01f));
     const std::vector<std::array<float, 2>> infinite{{infinity, 0.25f}, {0.25f, 0.25f}};
     CHECK(levelBeside(0.5f, infinite, 0) == levelBeside(0.3f, infinite, 0));
+    // 0.3 remains of these, but double loses it.
+    const std::vector<std::array<float, 2>> huge{{1e20f, 0.5f}, {0.6f, 0.5f}, {-4 * 1e20f, 0.5f}};
+    CHECK(levelBeside(0.5f, huge, 0) == levelBeside(0.3f, huge, 0));
 }
 
 TEST_CASE("Where colour is dithered alpha is the exact result rounded all the same, and not exceeded", "[ops]")
