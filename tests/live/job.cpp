@@ -1,11 +1,12 @@
 // Runs a job with a live view, as its user starts and ends it: job CASE COMMAND...
 //   button     the button on the page ends the job
 //   interrupt  Ctrl-C ends the job, as the launcher passes it on
+//   killed     the same, with a launcher that returns 1 and soon kills the ranks: that of Open MPI
 //   rest       while the camera rests, the ranks use no processor time
 //   fire       every camera that a viewer may ask for is rendered
 //   step       a simulation is paused, advanced by a step, and resumed
 //   taken      a second job on the same port ends with 1
-// COMMAND starts the job with --live 0. The job must end with 0 within a time limit.
+// COMMAND starts the job with --live 0. The job must end with 0, or 1 if killed, within a time limit.
 #include <httplib.h>
 #include <nlohmann/json.hpp>
 
@@ -123,7 +124,7 @@ public:
     void interrupt() const { kill(-pid_, SIGINT); } // as a terminal does: to all processes in the foreground
 
     // Waits until the job has ended.
-    void expectEnd()
+    void expectEnd(int code)
     {
         int status = 0;
         const auto begin = Clock::now();
@@ -131,7 +132,7 @@ public:
             fail("no status");
         pid_ = 0;
         std::printf("ended after %.2f s\n", std::chrono::duration<double>(Clock::now() - begin).count());
-        if (!WIFEXITED(status) || WEXITSTATUS(status) != 0)
+        if (!WIFEXITED(status) || WEXITSTATUS(status) != code)
             fail("it has ended with " + std::to_string(WIFEXITED(status) ? WEXITSTATUS(status) : -WTERMSIG(status)));
     }
 
@@ -299,11 +300,11 @@ try {
         step(job);
     else if (which == "taken")
         taken(job, argv + 2);
-    if (which == "interrupt")
+    if (which == "interrupt" || which == "killed")
         job.interrupt();
     else
         job.post("/command", {{"command", "end"}});
-    job.expectEnd();
+    job.expectEnd(which == "killed" ? 1 : 0);
     return 0;
 } catch (const std::exception& e) {
     std::fprintf(stderr, "job: %s\n", e.what());

@@ -127,7 +127,8 @@ if(DFB_PKG_CONFIG)
     list(JOIN ARGN "," expect)
     add_test(NAME package.${name} COMMAND ${CMAKE_COMMAND} -DCXX=${CMAKE_CXX_COMPILER} -DMODULE=${module} -DSTAGE=${stage}
       -DMAIN=${CMAKE_CURRENT_SOURCE_DIR}/package/main.cpp -DBUILD=${CMAKE_CURRENT_BINARY_DIR}/package/${name}
-      -DVERSION=${PROJECT_VERSION} -DEXPECT=${expect} ${_source} -P ${CMAKE_CURRENT_SOURCE_DIR}/package/pkg_config.cmake)
+      -DVERSION=${PROJECT_VERSION} -DEXPECT=${expect} -DGENERATOR=${CMAKE_GENERATOR} ${_source}
+      -P ${CMAKE_CURRENT_SOURCE_DIR}/package/pkg_config.cmake)
     set_tests_properties(package.${name} PROPERTIES LABELS package FIXTURES_REQUIRED dfb_stage)
   endfunction()
   set(_source "")

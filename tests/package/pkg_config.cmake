@@ -1,4 +1,5 @@
-# cmake -D CXX= -D MAIN= -D STAGE= -D BUILD= -D MODULE= -D VERSION= -D EXPECT= [-D SOURCE= -D OPTIONS=] -P pkg_config.cmake
+# cmake -D CXX= -D MAIN= -D STAGE= -D BUILD= -D MODULE= -D VERSION= -D EXPECT= [-D SOURCE= -D OPTIONS= -D GENERATOR=]
+#   -P pkg_config.cmake
 # Compiles main.cpp in the folder BUILD with the flags that pkg-config gives for MODULE, as installed in STAGE, and runs
 # it. With SOURCE, first installs dfb there with a build that finds no pkg-config modules, so that dfb.pc has the flags
 # of dependencies itself.
@@ -8,7 +9,7 @@ file(REMOVE_RECURSE ${BUILD})
 file(MAKE_DIRECTORY ${BUILD})
 if(SOURCE)
   string(REPLACE "|" ";" OPTIONS "${OPTIONS}")
-  execute_process(COMMAND ${CMAKE_COMMAND} -S ${SOURCE} -B ${BUILD}/build ${OPTIONS} -DDFB_BUILD_TESTS=OFF
+  execute_process(COMMAND ${CMAKE_COMMAND} -S ${SOURCE} -B ${BUILD}/build -G ${GENERATOR} ${OPTIONS} -DDFB_BUILD_TESTS=OFF
     -DDFB_BUILD_EXAMPLES=OFF -DDFB_BUILD_BENCH=OFF -DCMAKE_DISABLE_FIND_PACKAGE_PkgConfig=ON -DCMAKE_INSTALL_PREFIX=${STAGE}
     OUTPUT_QUIET COMMAND_ERROR_IS_FATAL ANY)
   execute_process(COMMAND ${CMAKE_COMMAND} --install ${BUILD}/build OUTPUT_QUIET COMMAND_ERROR_IS_FATAL ANY)
