@@ -49,6 +49,7 @@ try {
                 renderBall(ball, camera.eye(), camera.direction(x + 0.5, y + 0.5, width, height), rgba, depth);
             });
         }));
+        open.back().isDone(); // this rank has set all tiles of the frame: others need not wait until it calls end()
     }
     while (!open.empty())
         endOldest();

@@ -198,7 +198,7 @@ struct FrameReport : FrameSums {
     double totalMs = 0;               // begin() to the return of end(), this rank
     double renderMs = 0;              // begin() to the first call of isDone(), tryEnd() or end(), this rank
     double compositingOverheadMs = 0; // from that call to the return of end(), this rank
-    double renderMsMax = 0;           // all: the longest renderMs
+    double renderMsMax = 0; // all: the longest renderMs; of a rank that votes before end(), the time until then
     // This rank: who moved messages: calls of the program (Caller), or a thread of the library (Thread). With
     // InprocTransport the sending thread delivers them, which counts as Thread.
     Progress progress = Progress::Thread;

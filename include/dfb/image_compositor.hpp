@@ -91,7 +91,7 @@ public:
     ImageCompositor(const ImageCompositor&) = delete;
     ImageCompositor& operator=(const ImageCompositor&) = delete;
     // Collective. Whoever releases the connection last waits for all ranks. Must come before MPI_Finalize(). An open
-    // picture fails on all ranks.
+    // picture fails on all ranks, except that it may end well after start().
     ~ImageCompositor()
     {
         if (engine_->isOpen())
@@ -121,7 +121,8 @@ public:
 
     // Begins a picture: reads this rank's image and sends it. Every rank must call start() or startFailed() once for
     // each picture, then end(). The image's memory may be used again when this returns, unless you have promised
-    // InputImage::staysUntilEnd. Waits for another rank only if this one has too much under way
+    // InputImage::staysUntilEnd. If a thread of the library moves messages and the executor has workers, other ranks
+    // need not wait for this one's end(). Waits for another rank only if this one has too much under way
     // (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open, if a field of `frame` is out of range,
     // or on a thread that may not call MPI. Throws TransportError. For a wrong image, `place` or number of samples
     // end() throws, on all ranks.
@@ -441,6 +442,7 @@ DFB_COMPILED_ONCE void ImageCompositor::startFailed(const std::exception_ptr& wh
 {
     begin(frame);
     engine_->abort(engine_->frame(), why, -1);
+    engine_->closeInputs();
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place, const FrameConfig& frame)
@@ -453,6 +455,9 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
     } catch (...) {
         engine_->abort(engine_->frame(), std::current_exception(), -1);
     }
+    // A vote with checksums says whether pixels that must stay have changed, so that has to wait for end().
+    if (!image.staysUntilEnd || !connection_->config().checksums)
+        engine_->closeInputs();
 }
 
 DFB_COMPILED_ONCE FrameReport ImageCompositor::composite(const InputImage& image, int place, const FrameConfig& frame)

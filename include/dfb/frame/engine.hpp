@@ -69,6 +69,7 @@ public:
     // Gives this engine all engines of its framebuffer: when one has moved messages, all try to vote. Until then it
     // knows only itself.
     virtual void setTogether(std::vector<Engine*> engines) = 0;
+    virtual void closeInputs() = 0; // this rank sets no more tiles: it may vote before end(). Again: nothing
     virtual bool isDone() = 0;
     virtual FrameReport end() = 0;
     virtual void leave() noexcept = 0; // in place of end(), when an exception passes

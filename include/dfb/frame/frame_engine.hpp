@@ -127,6 +127,7 @@ public:
         outcome_->newFrame(FrameTerms::of(params, rank()));
         inputsSent_ = 0;
         renderNs_ = -1;
+        areInputsClosed_ = false;
         {
             const std::lock_guard<std::mutex> lock(figuresMutex_);
             figures_.clear();
@@ -288,10 +289,9 @@ public:
 
     void requireProgress() const override { mailbox_->requireProgress(); }
 
-    // The part of end() that waits for no other rank. Only the first call in a frame does anything.
-    void beginEnd()
+    void closeInputs() override
     {
-        if (renderNs_ >= 0)
+        if (std::exchange(areInputsClosed_, true))
             return;
         // In a frame that may be partial, the failure says why declare() was not called.
         if (params_.declared && !declarations_.declared() && !outcome_->failed())
@@ -299,7 +299,16 @@ public:
                 errorInfo(ErrorKind::InvalidArgument, "end() of a frame with declared inputs without declare()")));
         if (pipeline_->gather().displays())
             outcome_->guarded([this] { pipeline_->finishBackground(); });
+        outcome_->closeInputs();
+    }
+
+    // The part of end() that waits for no other rank. Only the first call in a frame does anything.
+    void beginEnd()
+    {
+        if (renderNs_ >= 0)
+            return;
         renderNs_ = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
+        closeInputs();
         outcome_->beginEnd();
     }
 
@@ -358,7 +367,7 @@ public:
     void leave() noexcept override
     {
         try {
-            if (!outcome_->failed()) // has no effect if isDone() has let this rank vote
+            if (!outcome_->failed()) // has no effect if closeInputs() has let this rank vote
                 outcome_->guarded([&] {
                     outcome_->failWhole(errorInfo(ErrorKind::Cancelled,
                                                   "the frame was left without end(). If by an exception: "
@@ -774,9 +783,9 @@ private:
         v.sums.compressedLinks = compression_.links();
         v.sums.inputsLeft = inputsSent_ - pipeline_->table().arrivedCount();
         v.maxima[Verdict::PeakMemoryBytes] = static_cast<std::int64_t>(pool_->peakBytes());
-        v.maxima[Verdict::RenderNs] = std::max<std::int64_t>(renderNs_, 0);
         v.maxima[Verdict::PeakInboxBytes] = static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes());
         v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
+        v.maxima[Verdict::RenderNs] = renderNs_ < 0 ? v.maxima[Verdict::TotalNs] : renderNs_.load();
         const std::lock_guard<std::mutex> lock(figuresMutex_);
         v.figures = Verdict::sortedSums(figures_);
         v.mergeErrors = Verdict::sortedSums(mergeErrors_);
@@ -827,6 +836,7 @@ private:
     Compression compression_;
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
     std::atomic<std::int64_t> renderNs_{-1};  // from begin() until end(); -1: not there yet
+    bool areInputsClosed_ = false;            // see closeInputs()
     Clock::time_point beginTime_;
     std::atomic<Clock::time_point> lastPoll_{}; // by pollNowAndThen()
 

@@ -1,9 +1,9 @@
 // OpenFrame: the frame that is open on this rank, as a state machine (drawn in docs/architecture.md). It knows which
 // messages and tasks belong to the frame, and what the frame still waits for.
 //
-// The thread that is in begin() or end() calls open(), beginEnd() and close(). Any thread calls fail(). Any thread calls
-// vote() when it has done something that the vote may have waited for. The thread that takes the result of the vote
-// calls decide(). close() may be called in every state: if the transport has failed, no verdict comes.
+// The thread that is in begin() or end() calls open(), closeInputs() and close(). Any thread calls fail(). Any thread
+// calls vote() when it has done something that the vote may have waited for. The thread that takes the result of the
+// vote calls decide(). close() may be called in every state: if the transport has failed, no verdict comes.
 #pragma once
 
 #include <dfb/comm/message.hpp>
@@ -23,14 +23,14 @@ namespace detail {
 
 enum class FrameState : std::uint8_t {
     Closed,    // before begin() and after end()
-    Rendering, // end() has not been called yet
-    Finishing, // end() waits for the tiles that this rank owns and, on the display rank, for those of the others
+    Rendering, // this rank may still set tiles: closeInputs() has not been called
+    Finishing, // waits for the tiles that this rank owns and, on the display rank, for those of the others
     Failed,    // on this rank or another; this rank has not voted yet
     Voted,     // this rank has said how the frame went for it, and waits for the others
     Decided    // all ranks have voted; work that is running may come to its end
 };
 
-// Any thread may call the members, except open(), beginEnd() and close(): one thread at a time.
+// Any thread may call the members, except open(), closeInputs() and close(): one thread at a time.
 class OpenFrame {
 public:
     // Frames have the numbers `first`, `first` + `step`, and so on.
@@ -68,8 +68,8 @@ public:
         return opened_;
     }
 
-    // Called when end() begins: from now on this rank only waits.
-    void beginEnd()
+    // This rank has set its last tile, and only waits from now on.
+    void closeInputs()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (state_ == FrameState::Rendering)
@@ -102,7 +102,7 @@ public:
         return isBeforeVote();
     }
 
-    // Returns true, once, if this rank is to vote now. It votes when it has called end() and `isDone()` is true, or
+    // Returns true, once, if this rank is to vote now. It votes when its inputs are closed and `isDone()` is true, or
     // when the frame has failed and nobody reads inputs in place any more. In both cases `may()` must be true.
     template <class IsDone, class May>
     bool vote(const IsDone& isDone, const May& may)

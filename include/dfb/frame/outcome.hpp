@@ -216,14 +216,19 @@ public:
     }
 
     // Called once a frame, when this rank has set its last tile: from now on it votes as soon as it can.
+    void closeInputs()
+    {
+        frame_.closeInputs();
+        tryVote();
+    }
+
+    // Called once a frame after closeInputs(), when the program first asks for the end: time-outs count from now.
     void beginEnd()
     {
-        frame_.beginEnd();
         endedAt_ = Clock::now();
         nextLook_ = endedAt_ + quiescence_.interval();
         if (hasTimeout())
             givesUpAt_ = endedAt_ + 2 * terms_.timeout();
-        tryVote();
     }
 
     // After beginEnd(): whether conclude() need not wait for the verdict any longer, because it is here or will not

@@ -8,8 +8,11 @@
 
 #include <algorithm>
 #include <array>
+#include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <functional>
+#include <future>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -402,6 +405,35 @@ TEST_CASE("Two framebuffers at once on one communicator", "[images]")
         }
     });
     CHECK(wrong == std::vector<std::size_t>(4));
+}
+
+TEST_CASE("A rank that works on between start() and end() holds up nobody", "[images]")
+{
+    constexpr int ranks = 3;
+    std::promise<void> othersAreDone;
+    std::atomic<int> done{0};
+    bool inTime = false;
+    std::vector<std::uint64_t> hashes(2);
+    dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+        dfb::FrameBufferConfig config(150, 90);
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        dfb::ImageCompositor compositor(dfb::connect<dfb::InprocTransport>(communicator), dfb::ImageBlend::InOrder,
+                                        config);
+        std::vector<float> pixels(4 * 150 * 90, 0.1f * static_cast<float>(compositor.rank() + 1));
+        for (int picture = 0; picture < 2; ++picture) {
+            compositor.start(dfb::InputImage(pixels.data()), compositor.rank());
+            if (compositor.rank() == 0 && picture == 1)
+                inTime = othersAreDone.get_future().wait_for(std::chrono::seconds(20)) == std::future_status::ready;
+            compositor.end();
+            if (compositor.rank() != 0 && picture == 1 && ++done == ranks - 1)
+                othersAreDone.set_value();
+            if (compositor.isDisplayRank())
+                hashes[static_cast<std::size_t>(picture)] =
+                    dfb::testing::hashOf(compositor.image().rgba8(), 4 * compositor.image().pixelCount());
+        }
+    });
+    CHECK(inTime);
+    CHECK(hashes[0] == hashes[1]);
 }
 
 TEST_CASE("allReduce outside frames", "[images]")

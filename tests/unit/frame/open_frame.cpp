@@ -35,7 +35,7 @@ dfb::ErrorInfo errorOf(dfb::ErrorKind kind)
 const std::vector<std::pair<const char*, std::function<void(OpenFrame&)>>> events{
     {"open", [](OpenFrame& f) { f.open(); }},
     {"open, failed", [](OpenFrame& f) { f.open(errorOf(dfb::ErrorKind::UserCode)); }},
-    {"begin end", [](OpenFrame& f) { f.beginEnd(); }},
+    {"close inputs", [](OpenFrame& f) { f.closeInputs(); }},
     {"fail", [](OpenFrame& f) { f.fail(errorOf(dfb::ErrorKind::UserCode)); }},
     {"note", [](OpenFrame& f) { f.note(errorOf(dfb::ErrorKind::UserCode)); }},
     {"vote, done", [](OpenFrame& f) { f.vote(yes, yes); }},
@@ -57,7 +57,7 @@ std::unique_ptr<OpenFrame> frameIn(FrameState state)
         frame->fail(errorOf(dfb::ErrorKind::UserCode));
         return frame;
     }
-    frame->beginEnd();
+    frame->closeInputs();
     if (state == FrameState::Finishing)
         return frame;
     frame->vote(yes, yes);
@@ -76,7 +76,7 @@ TEST_CASE("Every event in every state leads to the state that the drawing shows"
         std::vector<S> to; // by event
     };
     const std::vector<Row> rows{
-        // open     open, failed  begin end    fail         note          done         not done      may not
+        // open     open, failed  close        fail         note          done         not done      may not
         //     decide  close
         {S::Closed,
          {S::Rendering, S::Failed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed, S::Closed,
@@ -135,7 +135,7 @@ TEST_CASE("What a failure says depends on whether this rank has voted, and who w
     frame.close(noHelp);
 
     frame.open(); // a failure after the vote only stops this rank's work
-    frame.beginEnd();
+    frame.closeInputs();
     CHECK(frame.vote(yes, yes));
     failure = frame.fail(errorOf(dfb::ErrorKind::UserCode));
     CHECK((failure.isFirst && !failure.inTime && frame.failed()));
@@ -173,7 +173,7 @@ TEST_CASE("A rank does not vote on a frame that has failed while it reads inputs
 
     frame.open(); // a good frame waits for its tiles, not only for readers
     CHECK(frame.beginReading(true));
-    frame.beginEnd();
+    frame.closeInputs();
     CHECK_FALSE(frame.endReading());
     CHECK(frame.vote(yes, yes));
     frame.close(noHelp);
