@@ -178,9 +178,8 @@ public:
     // Takes the inputs that each tile will get in each pass; a tile that is not named gets none. Calls `counted(tile)`
     // for each tile with inputs, and then `ready(tile)` if they are all there. Also calls both for tiles without inputs
     // if the pixel operation is not pointwise, if an input has come all the same, or if the operation keeps earlier
-    // samples of the tile. `expected` must live as long as the frame. If the tracker or the
-    // operation throws, this goes on with the other tiles and throws at the end; `where` then names the first tile that
-    // failed.
+    // samples of the tile. `expected` must live as long as the frame. If the tracker or the operation throws, this goes
+    // on with the other tiles and throws at the end; `where` then names the first tile that failed.
     template <class Counted, class Ready>
     void declare(const ExpectedInputs& expected, ErrorInfo& where, const Counted& counted, const Ready& ready)
     {

@@ -57,7 +57,7 @@ inline bool isMissing(ErrorKind kind) noexcept
     return kind == ErrorKind::TimedOut || kind == ErrorKind::MissingInput;
 }
 
-// What must be equal in the FrameConfigs of all ranks; lists as hashes. Travels with each verdict, byte for byte.
+// The parts of a FrameConfig that must be equal on all ranks; lists as hashes. Travels byte for byte with each verdict.
 struct FrameTerms {
     std::uint64_t samplesHash = 0; // 0: there is no plan
     std::int64_t sampleCount = 0;  // of all tiles in the plan
