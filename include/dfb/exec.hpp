@@ -20,7 +20,8 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Between two iterations of a loop a worker runs the tasks that wait, so that compositing goes on beside rendering.
+// Between two iterations of a loop a worker runs the tasks that wait, so that compositing goes on beside rendering. If
+// all workers are in long iterations, the thread that waits for the loop does so.
 class Executor {
 public:
     using Task = std::function<void()>;
@@ -73,7 +74,8 @@ public:
     // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Any thread may call it,
     // several at once. Waits until all these calls have returned. If a worker of a ThreadExecutor calls it, that worker
     // alone runs the loop. Rethrows the first exception of a body; after it no other body begins. If the calling thread
-    // takes no part in the loop, it calls `meanwhile` every millisecond, which must not throw.
+    // takes no part in the loop, it calls `meanwhile` every millisecond, which must not throw. With a ThreadExecutor,
+    // it also runs tasks that have waited for about a millisecond.
     void parallelFor(std::size_t count, detail::FunctionRef<void(std::size_t)> body,
                      const std::function<void()>& meanwhile = nullptr)
     {
@@ -90,8 +92,7 @@ public:
                 if (!stop.exchange(true))
                     error = std::current_exception();
             }
-            // Not within a task: tasks that contain loops would nest without a limit.
-            while (depth() == 0 && help()) {
+            while (!isInTask() && help()) {
             }
         };
         runBeside(count, std::ref(guarded), meanwhile); // std::ref, unlike a copy, takes no memory
@@ -111,6 +112,9 @@ protected:
     {
         run(count, body);
     }
+
+    // Whether the calling thread runs a task. Loops within tasks run no tasks: these would nest without a limit.
+    static bool isInTask() noexcept { return depth() > 0; }
 
 private:
     // How many tasks, one within the other, the calling thread is running.
@@ -189,6 +193,8 @@ private:
             if (resting_ > 0)
                 return;
             ++signals_;
+            if (!std::exchange(hasTaskCome_, true))
+                loopDone_.notify_all();
         }
         wakeUp_.notify_one();
     }
@@ -210,13 +216,23 @@ private:
         std::unique_lock<std::mutex> lock(mutex_);
         loops_.push(&loop);
         wakeUp_.notify_all();
+        // All workers may be in long iterations while other ranks wait for a task. So this thread runs the tasks that
+        // have waited for `patience`.
+        constexpr std::chrono::milliseconds patience{1};
         const auto isDone = [&] { return loop.done == loop.count; };
-        while (meanwhile && !loopDone_.wait_for(lock, std::chrono::milliseconds(1), isDone)) {
+        for (;;) {
+            if (!meanwhile)
+                loopDone_.wait(lock, [&] { return isDone() || hasTaskCome_; });
+            if (loopDone_.wait_for(lock, patience, isDone))
+                return;
+            hasTaskCome_ = false;
             lock.unlock();
-            meanwhile();
+            if (meanwhile)
+                meanwhile();
+            while (!isInTask() && help()) {
+            }
             lock.lock();
         }
-        loopDone_.wait(lock, isDone);
     }
 
     void work()
@@ -258,6 +274,7 @@ private:
     std::condition_variable wakeUp_, loopDone_;
     detail::Fifo<Loop*> loops_;
     std::size_t signals_ = 0;
+    bool hasTaskCome_ = false;    // since a thread that waits for its loop last looked for tasks
     std::atomic<int> resting_{0}; // changes under mutex_
     bool stop_ = false;
     std::vector<std::thread> threads_;

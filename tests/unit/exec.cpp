@@ -270,10 +270,29 @@ TEST_CASE("Waiting tasks run between the iterations of a loop", "[executor]")
         std::sort(seen.begin(), seen.end());
         CHECK(seen == std::vector<int>{0, 1, 2, 3, 4});
     };
-    dfb::ThreadExecutor thread(1);
-    check(thread);
     dfb::CallerExecutor caller;
     check(caller);
+    dfb::ThreadExecutor thread(1);
+    caller.submit([&] { check(thread); }); // a thread in a task only waits, so the worker runs all
+    caller.help();
+}
+
+TEST_CASE("A thread that waits for a loop runs tasks while the workers are busy", "[executor]")
+{
+    dfb::ThreadExecutor executor(1);
+    std::thread::id runner;
+    std::atomic<bool> hasRun{false};
+    executor.parallelFor(1, [&](std::size_t) {
+        executor.submit([&] {
+            runner = std::this_thread::get_id();
+            hasRun = true;
+        });
+        const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(10);
+        while (!hasRun && std::chrono::steady_clock::now() < limit)
+            std::this_thread::yield();
+    });
+    REQUIRE(hasRun);
+    CHECK(runner == std::this_thread::get_id());
 }
 
 } // namespace exec_cases
