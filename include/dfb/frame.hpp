@@ -115,7 +115,7 @@ struct FrameConfig {
     // True: each rank calls Frame::declare(), and owners wait for the declared inputs. Loops set it themselves.
     bool declared = false;
     // The frame fails with ErrorKind::TimedOut if it is not complete this long after a rank called end(). It also fails
-    // if setTile() waits for room and no receiver takes a message of this rank for this long, or if nextJobs() waits
+    // if setTile() waits for room and no receiver takes a message of this rank for this long, or if nextJob() waits
     // this long. The error says what is missing and from whom. If there is still no verdict after twice the time, end()
     // throws TransportError. 0: no limit. At most 24 days. An input that is never sent needs no time-out: the frame
     // fails with ErrorKind::MissingInput some seconds after all ranks are in end().
@@ -147,11 +147,6 @@ inline bool operator==(const TileInput& a, const TileInput& b) noexcept
 {
     return a.tile == b.tile && a.source == b.source && a.part == b.part;
 }
-
-// Jobs [begin, end).
-struct JobRange {
-    std::int64_t begin = 0, end = 0;
-};
 
 // How the values of ranks are combined.
 enum class Reduce : std::uint8_t { Sum, Min, Max };

@@ -89,12 +89,16 @@ public:
     // The samples that a tile gets in this frame.
     TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 
-    // Hands out the jobs [0, count) to all ranks: returns the next range for this rank. Each job goes to one rank. An
-    // empty range means that no jobs are left, or that the frame or the transport has failed. `count` must be the same
-    // on all ranks and in all calls. Only the thread that began the frame may call it, and not from a task. Waits for
-    // the rank that hands out the jobs: usually not long, because the previous call has asked for this range. If it
-    // waits longer than FrameConfig::timeout, the frame fails. Throws InvalidArgument for a count below 0.
-    JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
+    // Hands out the jobs [0, count) to all ranks, each to one: returns the next job of this rank. -1 means that no jobs
+    // are left, or that the frame or the transport has failed. `count` must be the same on all ranks and in all calls.
+    // Any thread, several at once, but not from a task: see forEachWorker(). Waits for the rank that hands out the jobs
+    // when this rank has none left; it gets many at once. If it waits longer than FrameConfig::timeout, the frame
+    // fails. Throws InvalidArgument for a count below 0.
+    std::int64_t nextJob(std::int64_t count) const { return engine_->nextJob(count); }
+
+    // Calls body() once for each worker of the executor, on several at once, and waits for all calls. forEachTile()
+    // within the body runs on the worker that calls it. If the body throws, the frame fails as guard() says.
+    void forEachWorker(detail::FunctionRef<void()> body);
 
     // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. Use it for
     // measurements that all ranks must know, such as the cost of a brick. If the loop has a tile-brick owner that
@@ -341,6 +345,12 @@ DFB_COMPILED_ONCE void FrameBase::forEachJob(std::int64_t count, TileHeader* (*t
             keep(tile);
         });
     });
+}
+
+DFB_COMPILED_ONCE void FrameBase::forEachWorker(detail::FunctionRef<void()> body)
+{
+    const int workers = engine_->config().executor->concurrency();
+    guard([&] { engine_->parallelFor(static_cast<std::size_t>(workers), [&](std::size_t) { guard(body); }); });
 }
 
 DFB_COMPILED_ONCE void FrameBase::requireOpen() const

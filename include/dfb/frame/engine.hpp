@@ -59,7 +59,7 @@ public:
     virtual void declare(const std::vector<TileInput>& inputs) = 0;
     virtual void expectLayers(int layers) = 0;
     virtual TileSamples samples(int tile) const = 0;
-    virtual JobRange nextJobs(std::int64_t count) = 0;
+    virtual std::int64_t nextJob(std::int64_t count) = 0;
     virtual void addFigure(std::uint64_t key, double value) = 0;
     virtual void noteMergeError(int tile, double bound) = 0;
     virtual bool failed() const noexcept = 0;

@@ -207,10 +207,10 @@ public:
         mergeErrors_.push_back({static_cast<std::uint64_t>(tile), bound / std::max(samples(tile).count, 1)});
     }
 
-    JobRange nextJobs(std::int64_t count) override
+    std::int64_t nextJob(std::int64_t count) override
     {
         if (count < 0)
-            failArgument("nextJobs() of %lld jobs", static_cast<long long>(count));
+            failArgument("nextJob() of %lld jobs", static_cast<long long>(count));
         return jobs_->next(count, params_.timeout);
     }
 

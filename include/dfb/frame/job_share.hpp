@@ -3,10 +3,8 @@
 // JobExchange the messages.
 #pragma once
 
-#include <dfb/base/fifo.hpp>
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/comm/message.hpp>
-#include <dfb/frame.hpp>
 #include <dfb/frame/outcome.hpp>
 
 #include <algorithm>
@@ -18,6 +16,13 @@
 
 DFB_NAMESPACE_BEGIN
 namespace detail {
+
+// Jobs [begin, end).
+struct JobRange {
+    std::int64_t begin = 0, end = 0;
+
+    std::int64_t count() const noexcept { return end - begin; }
+};
 
 // A rank's request for jobs. It also carries the number of all jobs, as the rank that gets it may not know that yet.
 struct JobRequest {
@@ -33,7 +38,7 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         askedOf_ = count_ = -1;
-        mine_.clear();
+        mine_ = ahead_ = {};
         asked_ = exhausted_ = false;
     }
 
@@ -47,7 +52,7 @@ public:
                           std::min(request.count, std::int64_t{request.workers}));
         if (askedOf_ >= 0 && request.count != askedOf_)
             throw Error(errorInfo(ErrorKind::Disagreement,
-                                  printed("nextJobs() of %lld jobs on one rank and of %lld on another",
+                                  printed("nextJob() of %lld jobs on one rank and of %lld on another",
                                           static_cast<long long>(askedOf_), static_cast<long long>(request.count))));
         if (std::exchange(askedOf_, request.count) < 0)
             next_ = fixedPart(request.count);
@@ -66,38 +71,37 @@ public:
         if (!asked_ || range.begin < 0 || range.end < range.begin || range.end > count_)
             failMalformed("jobs that there are not", count_, range.end);
         asked_ = false;
-        if (range.begin < range.end)
-            mine_.push(range);
-        else
-            exhausted_ = true;
+        ahead_ = range;
+        exhausted_ = range.count() == 0;
     }
 
-    // Returns the next range to do: nullopt if it has been asked for and has not come yet; an empty one if there are no
-    // more. Sets `asks` if the caller must send a request now; at most one request is out.
-    std::optional<JobRange> take(std::int64_t count, int rank, int rankCount, bool& asks)
+    // Returns the next job to do: nullopt if jobs have been asked for and have not come yet; -1 if there are no more.
+    // Sets `asks` if the caller must send a request now, which is when one job is left: more jobs then come in time,
+    // and this rank holds few that others could begin sooner. At most one request is out.
+    std::optional<std::int64_t> take(std::int64_t count, int rank, int rankCount, bool& asks)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (std::exchange(count_, count) < 0) {
             const std::int64_t fixed = fixedPart(count);
-            const JobRange share{fixed * rank / rankCount, fixed * (rank + 1) / rankCount};
-            if (share.begin < share.end)
-                mine_.push(share);
+            mine_ = {fixed * rank / rankCount, fixed * (rank + 1) / rankCount};
         }
-        std::optional<JobRange> range;
-        if (!mine_.empty())
-            range = mine_.pop();
+        if (mine_.count() == 0)
+            mine_ = std::exchange(ahead_, {});
+        std::optional<std::int64_t> job;
+        if (mine_.count() > 0)
+            job = mine_.begin++;
         else if (exhausted_)
-            range.emplace();
-        asks = !asked_ && !exhausted_ && mine_.empty();
+            job = -1;
+        asks = !asked_ && !exhausted_ && mine_.count() <= 1 && ahead_.count() == 0;
         asked_ = asked_ || asks;
-        return range;
+        return job;
     }
 
-    // Whether take() would return a range.
+    // Whether take() would return a job, or -1.
     bool ready() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        return !mine_.empty() || exhausted_;
+        return mine_.count() > 0 || ahead_.count() > 0 || exhausted_;
     }
 
 private:
@@ -107,7 +111,7 @@ private:
     std::int64_t askedOf_ = -1; // the number of all jobs, from requests; -1: nobody has asked yet
     std::int64_t next_ = 0;     // to hand out
     std::int64_t count_ = -1;   // of all jobs; -1: nothing was taken yet
-    Fifo<JobRange> mine_;
+    JobRange mine_, ahead_;     // not taken yet; those ahead come after the others
     bool asked_ = false, exhausted_ = false;
 };
 
@@ -122,12 +126,13 @@ public:
 
     void newFrame() { share_.newFrame(); }
 
-    // The next range of `count` jobs; empty if there are no more, or the frame has failed. May wait for the rank that
-    // hands out jobs. If that takes longer than `timeout`, the frame fails; 0: it waits without a limit.
-    JobRange next(std::int64_t count, std::chrono::milliseconds timeout)
+    // The next of `count` jobs; -1 if there are no more, or the frame has failed. May wait for the rank that hands out
+    // jobs. If that takes longer than `timeout`, the frame fails; 0: it waits without a limit.
+    std::int64_t next(std::int64_t count, std::chrono::milliseconds timeout)
     {
-        std::optional<JobRange> range = take(count);
-        if (!range) {
+        while (!outcome_.failed()) {
+            if (const auto job = take(count))
+                return *job;
             std::optional<Mailbox::Clock::time_point> deadline;
             if (timeout.count() > 0)
                 deadline = Mailbox::Clock::now() + timeout;
@@ -137,9 +142,8 @@ public:
                 info.from = server_;
                 outcome_.fail(std::move(info));
             }
-            range = take(count);
         }
-        return range.value_or(JobRange{});
+        return -1;
     }
 
     // Throws what JobShare::give() does.
@@ -154,24 +158,29 @@ public:
         }
         if (header.kind != MessageKind::Jobs || source != server_)
             failMalformed("jobs from a rank that hands out none", server_, source);
-        share_.receive(bodyOf<JobRange>(message));
-        mailbox_.notify();
+        receiveMine(bodyOf<JobRange>(message));
     }
 
 private:
-    // Also asks for the next range at once, so that it comes while this one is worked on.
-    std::optional<JobRange> take(std::int64_t count)
+    void receiveMine(const JobRange& jobs)
+    {
+        share_.receive(jobs);
+        mailbox_.notify(); // other workers may wait for them
+    }
+
+    // Also asks for more jobs, so that they come while this one is done.
+    std::optional<std::int64_t> take(std::int64_t count)
     {
         bool asks = false;
-        const auto range = share_.take(count, mailbox_.rank(), mailbox_.size(), asks);
+        const auto job = share_.take(count, mailbox_.rank(), mailbox_.size(), asks);
         if (asks) {
             const JobRequest request{count, mailbox_.executor().concurrency(), 0};
             if (mailbox_.rank() == server_)
-                outcome_.guarded([&] { share_.receive(share_.give(request, mailbox_.size())); });
+                outcome_.guarded([&] { receiveMine(share_.give(request, mailbox_.size())); });
             else
                 mailbox_.sendBody(server_, MessageKind::JobRequest, frame_.number(), request);
         }
-        return range;
+        return job;
     }
 
     Mailbox& mailbox_;

@@ -134,9 +134,10 @@ public:
         case WorkDistribution::RoundRobin: render({rank, (count - rank + size - 1) / size, size}); break;
         case WorkDistribution::Dynamic: {
             const std::int64_t stride = scatteringStride(count);
-            for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
-                 range = frame.nextJobs(count))
-                render({range.begin * stride, range.end - range.begin, stride});
+            frame.forEachWorker([&] {
+                for (std::int64_t job = frame.nextJob(count); job >= 0; job = frame.nextJob(count))
+                    render({job * stride, 1});
+            });
             break;
         }
         }

@@ -278,7 +278,7 @@ TEST_CASE("A tile or a rank that there is not is refused, and nothing comes of i
                 texts.push_back(outcomeOf([&] { frame.noteMergeError(tile, 0.5); }));
             for (const int rank : {-1, 2})
                 texts.push_back(outcomeOf([&] { frame.hide(0, 1, rank); }));
-            texts.push_back(outcomeOf([&] { frame.nextJobs(-1); }));
+            texts.push_back(outcomeOf([&] { frame.nextJob(-1); }));
         }
         frame.forEachTile(-1, [](std::int64_t, auto&) { throw std::runtime_error("a job of less than none"); });
         frame.forEachTile(frame.ownedTiles(), [&](auto& tile) { frame.setTile(tile); });
@@ -293,23 +293,23 @@ TEST_CASE("A tile or a rank that there is not is refused, and nothing comes of i
     CHECK(has(texts[3], "rank 2 of 2"));
 }
 
-TEST_CASE("Ranks that call nextJobs() for different numbers of jobs are told so", "[errors]")
+TEST_CASE("Ranks that call nextJob() for different numbers of jobs are told so", "[errors]")
 {
     std::vector<std::string> texts(2);
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         FrameBuffer<dfb::ImageParallel> fb(communicator, dfb::FrameBufferConfig(20, 20));
         texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
             auto frame = fb.begin();
-            for (dfb::JobRange jobs{0, 1}; jobs.begin < jobs.end;)
-                jobs = frame.nextJobs(10 * (fb.rank() + 1));
+            while (frame.nextJob(10 * (fb.rank() + 1)) >= 0) {
+            }
             frame.end();
         });
     });
     INFO(joined(texts));
     CHECK(texts[0] == texts[1]);
     CHECK(has(texts[0], "ranks disagree"));
-    CHECK((has(texts[0], "nextJobs() of 10 jobs on one rank and of 20 on another")
-           || has(texts[0], "nextJobs() of 20 jobs on one rank and of 10 on another")));
+    CHECK((has(texts[0], "nextJob() of 10 jobs on one rank and of 20 on another")
+           || has(texts[0], "nextJob() of 20 jobs on one rank and of 10 on another")));
 }
 
 TEST_CASE("Frame parameters that cannot be are refused", "[errors]")

@@ -1,10 +1,12 @@
-// The number of threads of default executors: ranks that are threads of one process share the processors that it may
-// use.
+// The workers of a rank: how many a default executor has, as ranks that are threads of one process share its
+// processors; and how tiles are handed out to them.
 #include "catch.hpp"
 
 #include <dfb/dfb.hpp>
 
 #include <algorithm>
+#include <atomic>
+#include <chrono>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -48,6 +50,31 @@ TEST_CASE("Ranks that are threads divide the processors, and the report says how
         CHECK(threadsOf(ranks) == std::vector<std::vector<int>>(static_cast<std::size_t>(ranks), {each, each}));
     }
     CHECK(threadsOf(1, std::make_shared<dfb::ThreadExecutor>(5)) == std::vector<std::vector<int>>{{5, 5}});
+}
+
+TEST_CASE("A worker that is in a tile for long holds up no other tile", "[threads]")
+{
+    for (const int ranks : {1, 2}) {
+        constexpr int tiles = 10;
+        std::atomic<int> rendered{0};
+        std::atomic<bool> isFirst{true};
+        dfb::runRanks(ranks, [&](const dfb::InprocCommunicator& communicator) {
+            dfb::FrameBufferConfig config(16 * tiles, 16);
+            config.executor = std::make_shared<dfb::ThreadExecutor>(2);
+            FrameBuffer fb(communicator, config);
+            dfb::ImageParallelLoop(fb, dfb::WorkDistribution::Dynamic).render([&](auto& tile) {
+                if (isFirst.exchange(false)) {
+                    const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(10);
+                    while (rendered < tiles - 1 && std::chrono::steady_clock::now() < limit)
+                        std::this_thread::yield();
+                    rendered += rendered < tiles - 1 ? -tiles : 0;
+                }
+                ++rendered;
+                tile.fill({0, 0, 0, 1});
+            });
+        });
+        CHECK(rendered == tiles);
+    }
 }
 
 #if defined(__linux__)
