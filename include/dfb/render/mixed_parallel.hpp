@@ -8,6 +8,10 @@
 //   void plan(const SharedWorld&, const std::vector<BrickInTile>&, const std::vector<int>& passes);
 //                                  called once a frame, before operator(): with all pairs, and the number of passes of
 //                                  each. FrameReport::figures then has the cost of each pair, for the next plan.
+// and, if it knows costs,
+//   double costOf(const SharedBrick& brick, int tile) const;      in any unit, 0 if it is not known. In a
+//                                  MixedParallelLoop, a rank first renders what costs more than twice the mean, so that
+//                                  no worker is left with it at the end.
 // MixedParallelLoop calls both on the thread that is in start(). OrderedLoop calls operator() from several workers at
 // once as well. An owner without plan() may be asked about pass 0 more than once. All ranks must get the same answers.
 // If it picks a rank that does not hold the brick, the frame fails.
@@ -119,6 +123,13 @@ public:
             table_[keyOf(world, pairs[job.pair])][static_cast<std::size_t>(job.pass)] = job.rank;
     }
 
+    // The cost in the last frame; 0 if it is not known.
+    double costOf(const SharedBrick& brick, int tile) const
+    {
+        const auto known = costs_.find(keyOf(brick.id, tile));
+        return known != costs_.end() ? known->second : 0;
+    }
+
     // After plan(). Throws std::out_of_range for a pair that plan() did not get.
     int operator()(const SharedBrick& brick, int tile, int pass) const
     {
@@ -163,6 +174,7 @@ private:
 
 namespace detail {
 
+DFB_DETECTS(has_costs_v, std::declval<const T&>().costOf(std::declval<const SharedBrick&>(), int()));
 DFB_DETECTS(has_plan_v,
             std::declval<T&>().plan(std::declval<const SharedWorld&>(), std::declval<const std::vector<BrickInTile>&>(),
                                     std::declval<const std::vector<int>&>()));
@@ -209,7 +221,27 @@ struct MixedWork {
             world, [&](const SharedBrick& brick, int tile, int pass) { return owner(brick, tile, pass); }, own);
     }
 
+    // Puts the jobs first that cost more than twice the mean, if the owner knows costs.
+    template <class Owner>
+    void renderCostlyFirst(const SharedWorld& world, const Owner& owner)
+    {
+        if constexpr (has_costs_v<Owner>)
+            moveCostly([&](const Job& job) {
+                const BrickInTile& pair = pairs[job.item];
+                return owner.costOf(brickOf(world, pair), pair.tile) / passes[job.item];
+            });
+    }
+
 private:
+    void moveCostly(FunctionRef<double(const Job&)> costOf)
+    {
+        double sum = 0;
+        for (const Job& job : jobs)
+            sum += costOf(job);
+        const double limit = 2 * sum / static_cast<double>(std::max<std::size_t>(jobs.size(), 1));
+        std::stable_partition(jobs.begin(), jobs.end(), [&](const Job& job) { return costOf(job) > limit; });
+    }
+
     void countPasses(FrameBase& frame)
     {
         passes.clear();
@@ -412,6 +444,7 @@ public:
         frame.guard([&] {
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             work_.findJobs(frame, world_, owner_, fb_.rank());
+            work_.renderCostlyFirst(world_, owner_);
             // The first rank that holds the brick declares the tile, even if another one renders it.
             inputs_.clear();
             for (const BrickInTile& pair : work_.pairs)

@@ -90,6 +90,32 @@ TEST_CASE("Fronts come first, and all else in the order that it had", "[mixed]")
     CHECK(work.generationOf(work.jobs[5]) == 2);
 }
 
+TEST_CASE("What costs more than twice the mean comes first, and all else in the order that it had", "[mixed]")
+{
+    struct Owner {
+        int operator()(const dfb::SharedBrick&, int, int) const { return 0; }
+        double costOf(const dfb::SharedBrick&, int tile) const { return tile == 2 || tile == 4 ? 20 : 1; }
+    } owner;
+    dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<dfb::AlphaBlend> fb(communicator, dfb::FrameBufferConfig(10, 10));
+        const dfb::SharedWorld world(fb, dfb::World({{7, {{0, 0, 0}, {1, 1, 1}}}}));
+        dfb::detail::MixedWork work;
+        for (int tile = 0; tile < 6; ++tile)
+            work.pairs.push_back({0, tile});
+        // A pass of tile 2 costs 5: more than the mean, 44 / 9, but less than twice the mean.
+        work.passes = {1, 1, 4, 1, 1, 1};
+        for (const std::size_t item : {0, 1, 2, 2, 2, 2, 3, 4, 5})
+            work.jobs.push_back({item, 0});
+        work.renderCostlyFirst(world, owner);
+        std::vector<std::size_t> items;
+        for (const dfb::detail::Job& job : work.jobs)
+            items.push_back(job.item);
+        CHECK(items == std::vector<std::size_t>{4, 0, 1, 2, 2, 2, 2, 3, 5});
+        work.renderCostlyFirst(world, dfb::RoundRobinBricks()); // knows no costs
+        CHECK(work.jobs.front().item == 4);
+    });
+}
+
 TEST_CASE("A cost that is not a number leaves the work shared out evenly", "[mixed]")
 {
     int onRank[2] = {};
