@@ -95,7 +95,7 @@ public:
             while (!isInTask() && help()) {
             }
         };
-        runBeside(count, std::ref(guarded), meanwhile); // std::ref, unlike a copy, takes no memory
+        run(count, std::ref(guarded), meanwhile); // std::ref, unlike a copy, takes no memory
         if (error)
             std::rethrow_exception(error);
     }
@@ -104,14 +104,10 @@ protected:
     // Makes a worker call help() soon, unless hasWorkers() is false. Any thread calls it, also one that moves messages.
     // If it throws, a thread that waits for the frame runs the task.
     virtual void wake() = 0;
-    // Calls body(i) for all i on the workers, and waits; the calling thread may take part. The body does not throw.
-    virtual void run(std::size_t count, const std::function<void(std::size_t)>& body) = 0;
-    // Does so, and calls `meanwhile`, unless it is null, as parallelFor() says.
-    virtual void runBeside(std::size_t count, const std::function<void(std::size_t)>& body,
-                           const std::function<void()>& /*meanwhile*/)
-    {
-        run(count, body);
-    }
+    // Calls body(i) for all i on the workers, and waits. Either the calling thread takes part, or it calls `meanwhile`
+    // every millisecond, unless that is null. The body does not throw.
+    virtual void run(std::size_t count, const std::function<void(std::size_t)>& body,
+                     const std::function<void()>& meanwhile) = 0;
 
     // Whether the calling thread runs a task. Loops within tasks run no tasks: these would nest without a limit.
     static bool isInTask() noexcept { return depth() > 0; }
@@ -199,13 +195,8 @@ private:
         wakeUp_.notify_one();
     }
 
-    void run(std::size_t count, const std::function<void(std::size_t)>& body) override
-    {
-        runBeside(count, body, nullptr);
-    }
-
-    void runBeside(std::size_t count, const std::function<void(std::size_t)>& body,
-                   const std::function<void()>& meanwhile) override
+    void run(std::size_t count, const std::function<void(std::size_t)>& body,
+             const std::function<void()>& meanwhile) override
     {
         if (current() == this || resting_ > 0) {
             for (std::size_t i = 0; i < count; ++i)
@@ -299,7 +290,7 @@ public:
 
 private:
     void wake() override {}
-    void run(std::size_t count, const std::function<void(std::size_t)>& body) override
+    void run(std::size_t count, const std::function<void(std::size_t)>& body, const std::function<void()>&) override
     {
         for (std::size_t i = 0; i < count; ++i)
             body(i);

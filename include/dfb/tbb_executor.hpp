@@ -43,7 +43,7 @@ private:
         });
     }
 
-    void run(std::size_t count, const std::function<void(std::size_t)>& body) override
+    void run(std::size_t count, const std::function<void(std::size_t)>& body, const std::function<void()>&) override
     {
         arena_.execute([&] { tbb::parallel_for(std::size_t{0}, count, body, tbb::simple_partitioner()); });
     }

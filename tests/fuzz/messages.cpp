@@ -78,7 +78,7 @@ private:
         while (!isHeld_ && help()) {
         }
     }
-    void run(std::size_t count, const std::function<void(std::size_t)>& body) override
+    void run(std::size_t count, const std::function<void(std::size_t)>& body, const std::function<void()>&) override
     {
         for (std::size_t i = 0; i < count; ++i)
             body(i);

@@ -176,7 +176,7 @@ TEST_CASE("A task is queued once, even if no worker can be woken", "[executor]")
     struct Sleeper final : dfb::Executor {
         int concurrency() const noexcept override { return 1; }
         void wake() override { throw std::bad_alloc(); }
-        void run(std::size_t, const std::function<void(std::size_t)>&) override {}
+        void run(std::size_t, const std::function<void(std::size_t)>&, const std::function<void()>&) override {}
     } executor;
     int runs = 0;
     executor.submit([&] { ++runs; });
