@@ -201,11 +201,11 @@ public:
 private:
     // Of compressed to raw bytes: above `worse` compression stops, and only below `better` it starts again.
     static constexpr double worse = 0.95, better = 0.9;
-    static constexpr int firstInterval = 16, longestInterval = 512;
+    static constexpr int firstInterval = 16, longestInterval = 64; // in frames: a trial costs little
 
     struct Peer {
         std::atomic<std::int64_t> raw{0}, sent{0};
-        int pause = 0, interval = firstInterval; // in frames
+        int pause = 0, interval = firstInterval;
     };
 
     std::shared_ptr<const Codec> codec_;

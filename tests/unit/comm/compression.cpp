@@ -54,16 +54,15 @@ TEST_CASE("Compression for a rank that gains nothing is tried more and more seld
 {
     const std::vector<int> tried = triedIn(3000, [](int) { return 1000; });
     REQUIRE(tried.size() > 8);
-    CHECK(std::vector<int>(tried.begin(), tried.begin() + 4) == std::vector<int>{0, 17, 50, 115});
-    CHECK(tried[8] - tried[7] == 513);
-    CHECK(tried.size() < 12);
+    CHECK(std::vector<int>(tried.begin(), tried.begin() + 5) == std::vector<int>{0, 17, 50, 115, 180});
+    CHECK(tried.size() < 50); // once in 65 frames
 }
 
 TEST_CASE("A rank that begins to gain is compressed for again, if it is worth it", "[compression]")
 {
     CHECK(triedIn(1000, [](int frame) { return frame < 10 ? 1000 : 500; }).size() == 1000 - 16);
     // There is a margin between giving up and coming back.
-    CHECK(triedIn(1000, [](int frame) { return frame < 10 ? 1000 : 930; }).size() < 12);
+    CHECK(triedIn(1000, [](int frame) { return frame < 10 ? 1000 : 930; }).size() < 20);
 }
 
 } // namespace compression_cases
