@@ -110,7 +110,11 @@ public:
     }
 
 private:
-    static bool nearer(const Segment& a, const Segment& b) { return a.depth < b.depth; }
+    // A depth of NaN counts as farthest.
+    static bool nearer(const Segment& a, const Segment& b)
+    {
+        return a.depth < b.depth || (std::isnan(b.depth) && !std::isnan(a.depth));
+    }
 
     // Doubles the room of each pixel.
     void makeRoom()

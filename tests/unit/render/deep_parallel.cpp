@@ -2,7 +2,9 @@
 
 #include <dfb/render/deep_parallel.hpp>
 
+#include <limits>
 #include <memory>
+#include <vector>
 
 TEST_CASE("A deep tile keeps 1 to 65535 segments a pixel")
 {
@@ -35,5 +37,26 @@ TEST_CASE("The error bound of a deep tile holds for alpha above 1")
         deep.add(0, 0, {{0, 0.25f, 0, 0.25f}, 1, 1.5f});
         deep.add(0, 0, {{0, 0, 0.5f, 0.5f}, 3, 3.5f});
         CHECK(deep.errorBound() > 0);
+    }
+}
+
+TEST_CASE("A segment of depth NaN is the farthest, whenever it comes")
+{
+    const float nan = std::numeric_limits<float>::quiet_NaN();
+    const dfb::Segment first{{0.9f, 0, 0, 0.9f}, 1, 1}, second{{0, 0.3f, 0, 0.3f}, 2, 2},
+        last{{0, 0, 0.5f, 0.5f}, nan, nan};
+    for (const auto& order : {std::vector{last, first, second}, {first, last, second}, {second, first, last}}) {
+        dfb::DeepTile deep(3);
+        dfb::TileHeader header;
+        header.region = {0, 0, 1, 1};
+        deep.reset(header);
+        for (const dfb::Segment& segment : order)
+            deep.add(0, 0, segment);
+        auto layer = std::make_unique<dfb::Tile<dfb::allChannels, 8>>();
+        for (int i = 0; i < 3; ++i) {
+            layer->clear();
+            deep.writeLayer(i, *layer);
+            CHECK(layer->color[i] > 0);
+        }
     }
 }
