@@ -14,7 +14,8 @@
 DFB_NAMESPACE_BEGIN
 
 // The arena has room for `threadCount` threads. oneTBB itself limits the workers of a process to one less than
-// its cores; the thread that calls parallelFor() takes part.
+// its cores; the thread that calls parallelFor() takes part. If several ranks are threads of one process, give them
+// ThreadExecutors: they would share oneTBB's few workers, and one that waits for another rank would hold up its tasks.
 class TbbExecutor final : public Executor {
 public:
     // `threadCount` 0: one thread for each processor that oneTBB finds for this process. That is too many if several
@@ -27,6 +28,8 @@ public:
     // Waits until all submitted tasks have run. No loop may be under way.
     ~TbbExecutor() override
     {
+        while (help()) { // tasks that no thread could be woken for
+        }
         while (enqueued_ > 0)
             std::this_thread::yield();
     }
@@ -37,15 +40,25 @@ private:
     void wake() override
     {
         ++enqueued_;
-        arena_.enqueue([this] {
-            help();
-            --enqueued_; // last: the destructor waits for it
-        });
+        try {
+            arena_.enqueue([this] {
+                help();
+                --enqueued_; // last: the destructor waits for it
+            });
+        } catch (...) {
+            --enqueued_;
+            throw;
+        }
     }
 
     void run(std::size_t count, const std::function<void(std::size_t)>& body, const std::function<void()>&) override
     {
-        arena_.execute([&] { tbb::parallel_for(std::size_t{0}, count, body, tbb::simple_partitioner()); });
+        arena_.execute([&] {
+            if (count == 1)
+                body(0); // a loop within a loop, as a rule: quicker, and not on another thread
+            else
+                tbb::parallel_for(std::size_t{0}, count, body, tbb::simple_partitioner());
+        });
     }
 
     tbb::task_arena arena_;
