@@ -99,9 +99,10 @@ struct FrameConfig {
     // they go on from the last frame, if that had this accumulationId.
     int passes = 1;
     // If not null, it has the samples of each tile, by the tile's index, and replaces `passes`; see sampling.hpp. A
-    // tile without samples is not rendered, and the image keeps its pixels from the last frame. That frame must have
-    // ended well, and with keepsState must have had the same accumulationId. Without keepsState the samples of a tile
-    // begin with 0, and tiles without samples need framesInFlight 1 and a pixel operation that is pointwise.
+    // tile without samples is not rendered, and the image keeps its pixels from the last frame, which must not have
+    // failed. With keepsState that frame must have had the same accumulationId. Without keepsState the samples of a
+    // tile begin with 0, tiles without samples need framesInFlight 1 and a pixel operation that is pointwise, and in
+    // the first frame and after resize() they show the background.
     SamplePlan samples;
     // For an ErrorBudget or HalfLevel: the most inputs that a pixel has in a pass. 0: not known, counts as 65536.
     // ImageParallelLoop, MixedParallelLoop, OrderedLoop and ImageCompositor set it; the other loops do not.

@@ -45,7 +45,7 @@ struct SamplingConfig {
 //       sampler.update(loop.render(renderTile, sampler.next()));
 //
 // Call reset(), not update(), after a frame that throws FrameError or is partial (FrameReport::failure): the
-// accumulated samples are lost. One thread at a time may use it. Its members send nothing and wait for nothing.
+// accumulated samples are lost. After resize() make a new sampler. One thread at a time may use it. Its members send nothing and wait for nothing.
 class AdaptiveSampler {
 public:
     // Throws InvalidArgument unless firstSamples is 2 or more, maxSamples at least firstSamples, frameSamples 1 or
