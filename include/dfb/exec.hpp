@@ -21,7 +21,7 @@
 DFB_NAMESPACE_BEGIN
 
 // Between two iterations of a loop a worker runs the tasks that wait, so that compositing goes on beside rendering. If
-// all workers are in long iterations, the thread that waits for the loop does so.
+// all workers of a ThreadExecutor are in long iterations, the thread that waits for the loop does so.
 class Executor {
 public:
     using Task = std::function<void()>;
@@ -73,9 +73,9 @@ public:
 
     // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Any thread may call it,
     // several at once. Waits until all these calls have returned. If a worker of a ThreadExecutor calls it, that worker
-    // alone runs the loop. Rethrows the first exception of a body; after it no other body begins. If the calling thread
-    // takes no part in the loop, it calls `meanwhile` every millisecond, which must not throw. With a ThreadExecutor,
-    // it also runs tasks that have waited for about a millisecond.
+    // alone runs the loop; with a TbbExecutor others may take part. Rethrows the first exception of a body; after it no
+    // other body begins. If the calling thread takes no part in the loop, it calls `meanwhile` every millisecond, which
+    // must not throw. With a ThreadExecutor, it also runs tasks if some still wait after a millisecond.
     void parallelFor(std::size_t count, detail::FunctionRef<void(std::size_t)> body,
                      const std::function<void()>& meanwhile = nullptr)
     {
@@ -189,7 +189,7 @@ private:
             if (resting_ > 0)
                 return;
             ++signals_;
-            if (!std::exchange(hasTaskCome_, true))
+            if (watching_ > 0)
                 loopDone_.notify_all();
         }
         wakeUp_.notify_one();
@@ -207,21 +207,25 @@ private:
         std::unique_lock<std::mutex> lock(mutex_);
         loops_.push(&loop);
         wakeUp_.notify_all();
-        // All workers may be in long iterations while other ranks wait for a task. So this thread runs the tasks that
-        // have waited for `patience`.
-        constexpr std::chrono::milliseconds patience{1};
+        // All workers may be in long iterations while other ranks wait for a task. So if tasks still wait after a
+        // millisecond, this thread runs them, too. It then stands in for a worker: loops within tasks are its own.
         const auto isDone = [&] { return loop.done == loop.count; };
+        const bool helps = !isInTask();
         for (;;) {
-            if (!meanwhile)
-                loopDone_.wait(lock, [&] { return isDone() || hasTaskCome_; });
-            if (loopDone_.wait_for(lock, patience, isDone))
-                return;
-            hasTaskCome_ = false;
-            lock.unlock();
-            if (meanwhile)
-                meanwhile();
-            while (!isInTask() && help()) {
+            if (!meanwhile && !isDone() && !(helps && hasTasks())) {
+                ++watching_;
+                loopDone_.wait(lock);
+                --watching_;
             }
+            if (loopDone_.wait_for(lock, std::chrono::milliseconds(1), isDone))
+                return;
+            lock.unlock();
+            ThreadExecutor* const before = std::exchange(current(), this);
+            do {
+                if (meanwhile)
+                    meanwhile();
+            } while (helps && help());
+            current() = before;
             lock.lock();
         }
     }
@@ -265,7 +269,7 @@ private:
     std::condition_variable wakeUp_, loopDone_;
     detail::Fifo<Loop*> loops_;
     std::size_t signals_ = 0;
-    bool hasTaskCome_ = false;    // since a thread that waits for its loop last looked for tasks
+    int watching_ = 0;            // threads that wait for their loop, or for a task
     std::atomic<int> resting_{0}; // changes under mutex_
     bool stop_ = false;
     std::vector<std::thread> threads_;

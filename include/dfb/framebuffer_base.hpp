@@ -91,13 +91,16 @@ public:
 
     // Hands out the jobs [0, count) to all ranks, each to one: returns the next job of this rank. -1 means that no jobs
     // are left, or that the frame or the transport has failed. `count` must be the same on all ranks and in all calls.
-    // Any thread, several at once, but not from a task: see forEachWorker(). Waits for the rank that hands out the jobs
-    // when this rank has none left; it gets many at once. If it waits longer than FrameConfig::timeout, the frame
+    // Call it within forEachWorker(). Waits for the rank that hands out the jobs when this rank has none left; it gets
+    // many at once. If it waits longer than FrameConfig::timeout, the frame
     // fails. Throws InvalidArgument for a count below 0.
     std::int64_t nextJob(std::int64_t count) const { return engine_->nextJob(count); }
 
     // Calls body() once for each worker of the executor, on several at once, and waits for all calls. forEachTile()
-    // within the body runs on the worker that calls it. If the body throws, the frame fails as guard() says.
+    // of one tile within the body runs on the worker that calls it. If the body throws, the frame fails as guard()
+    // says. Only the thread that began the frame may call it, and not from a task. Below MPI_THREAD_SERIALIZED this
+    // thread moves messages meanwhile; so with an executor in which it takes part, its body must not end before the
+    // jobs do.
     void forEachWorker(detail::FunctionRef<void()> body);
 
     // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. Use it for

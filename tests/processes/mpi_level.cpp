@@ -253,6 +253,31 @@ void whileWorkersRender()
         checkImage(fb.image(), fb.layout(), 1, "while workers rendered");
 }
 
+// Workers wait for jobs, which come even if they may not call MPI; also while the thread that moves messages takes part
+// in the loop, or runs a task that has a loop of its own.
+void jobsOnDemand(const std::shared_ptr<dfb::Executor>& executor, int frameCount, std::chrono::milliseconds perTile)
+{
+    auto config = smallConfig();
+    config.image.width = config.image.height = 100;
+    config.executor = executor;
+    config.onTile = [&](int, const auto&, const auto&) { executor->parallelFor(4, [](std::size_t) {}); };
+    FrameBuffer fb(MPI_COMM_WORLD, config);
+    dfb::ImageParallelLoop loop(fb, dfb::WorkDistribution::Dynamic);
+    dfb::FrameConfig params;
+    params.passes = 3;
+    for (int frame = 0; frame < frameCount; ++frame)
+        loop.render(
+            [&](auto& tile) {
+                const auto end = std::chrono::steady_clock::now() + perTile;
+                while (std::chrono::steady_clock::now() < end)
+                    std::this_thread::yield();
+                tile.fill({0, greenOf(1) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
+            },
+            params);
+    if (fb.isDisplayRank())
+        checkImage(fb.image(), fb.layout(), 1, "jobs on demand");
+}
+
 // Workers give tiles to two framebuffers, each with a connection of its own.
 void twoConnections()
 {
@@ -381,6 +406,11 @@ int main(int argc, char** argv)
         wallAndSharedWorld();
         smallPool();
         whileWorkersRender();
+        jobsOnDemand(std::make_shared<dfb::ThreadExecutor>(1), 2, std::chrono::milliseconds(3));
+        jobsOnDemand(std::make_shared<dfb::ThreadExecutor>(2), 2, std::chrono::milliseconds(1));
+#if defined(DFB_HAS_TBB)
+        jobsOnDemand(std::make_shared<dfb::TbbExecutor>(2), 300, std::chrono::milliseconds(0));
+#endif
         overlaps = 0;
         twoConnections();
         check(level == MPI_THREAD_MULTIPLE || overlaps == 0, "calls of MPI at once", std::to_string(overlaps));

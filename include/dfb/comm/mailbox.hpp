@@ -363,6 +363,8 @@ public:
             const auto goesOn = [&] {
                 if (!over())
                     return !late();
+                if (!connection_->mayPoll())
+                    return false; // only another thread can send them
                 if (deadline && !leaveBy)
                     leaveBy = std::max(*deadline, Clock::now() + std::chrono::seconds(1));
                 return !failed() && !connection_->quiet() && !(leaveBy && Clock::now() >= *leaveBy);

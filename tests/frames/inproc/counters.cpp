@@ -19,6 +19,7 @@
 #include <mutex>
 #include <new>
 #include <numeric>
+#include <optional>
 #include <string>
 #include <thread>
 #include <utility>
@@ -423,9 +424,12 @@ std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
         });
         waitUntil(step, 1);
         {
-            auto frame = start();
+            std::optional<typename Fb::Frame> frame;
+            dfb::CallerExecutor caller;
+            caller.submit([&] { frame.emplace(start()); }); // in a task this thread runs no others
+            caller.help();
             waitUntil(tilesOfWorker[rank], 1);
-            frame.end();
+            frame->end();
         }
         meet();
         // A frame composited by this thread.
