@@ -91,9 +91,9 @@ public:
 
     // Hands out the jobs [0, count) to all ranks, each to one: returns the next job of this rank. -1 means that no jobs
     // are left, or that the frame or the transport has failed. `count` must be the same on all ranks and in all calls.
-    // Call it within forEachWorker(). Waits for the rank that hands out the jobs when this rank has none left; it gets
-    // many at once. If it waits longer than FrameConfig::timeout, the frame
-    // fails. Throws InvalidArgument for a count below 0.
+    // Call it within forEachWorker(). Waits for the rank that hands out the jobs if this rank has none left; it gets
+    // several at once. If that takes longer than FrameConfig::timeout, the frame fails. Throws InvalidArgument for a
+    // count below 0.
     std::int64_t nextJob(std::int64_t count) const { return engine_->nextJob(count); }
 
     // Calls body() once for each worker of the executor, on several at once, and waits for all calls. forEachTile()
