@@ -328,6 +328,18 @@ public:
         connection_->interrupt();
     }
 
+    // For as long as it lives, a worker waits: perhaps all of them do.
+    class WorkerWaits {
+    public:
+        explicit WorkerWaits(Mailbox& mailbox) noexcept : mailbox_(mailbox) { ++mailbox_.waitingWorkers_; }
+        ~WorkerWaits() { --mailbox_.waitingWorkers_; }
+        WorkerWaits(const WorkerWaits&) = delete;
+        WorkerWaits& operator=(const WorkerWaits&) = delete;
+
+    private:
+        Mailbox& mailbox_;
+    };
+
     // Waits until ready(), which must not take a lock that a caller of notify() holds. Moves messages itself if no
     // other thread does. Returns false if `deadline` passes before. Throws TransportError.
     bool wait(FunctionRef<bool()> ready, std::optional<Clock::time_point> deadline = std::nullopt)
@@ -346,7 +358,7 @@ public:
             for (std::chrono::milliseconds pause = shortest; !over() && !late();) {
                 const auto next = Clock::now() + pause;
                 changed_.wait_until(lock, deadline ? std::min(*deadline, next) : next,
-                                    [&] { return over() || (!executor_->hasWorkers() && executor_->hasTasks()); });
+                                    [&] { return over() || (runsTasksAtOnce() && executor_->hasTasks()); });
                 lock.unlock();
                 pause = std::min(2 * pause, longest);
                 while (!over() && !late() && executor_->help())
@@ -609,9 +621,12 @@ private:
             taskDone();
             throw;
         }
-        if (!executor_->hasWorkers()) // a thread that waits runs it
+        if (runsTasksAtOnce())
             notify();
     }
+
+    // Whether a thread in wait() is to run a task as soon as it comes: perhaps no worker can.
+    bool runsTasksAtOnce() const noexcept { return waitingWorkers_ > 0 || !executor_->hasWorkers(); }
 
     void taskDone()
     {
@@ -780,6 +795,7 @@ private:
 
     std::mutex mutex_;
     std::condition_variable changed_;
+    std::atomic<int> waitingWorkers_{0};
     Fifo<Arrival> inbox_;
     std::vector<Left> left_;
     int tasks_ = 0; // submitted and not yet done

@@ -136,6 +136,7 @@ public:
             std::optional<Mailbox::Clock::time_point> deadline;
             if (timeout.count() > 0)
                 deadline = Mailbox::Clock::now() + timeout;
+            const Mailbox::WorkerWaits waits(mailbox_);
             if (!mailbox_.wait([this] { return share_.ready() || outcome_.failed(); }, deadline)) {
                 ErrorInfo info =
                     errorInfo(ErrorKind::TimedOut, printed("no word of rank %d on what there is to render", server_));
