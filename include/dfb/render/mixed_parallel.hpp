@@ -12,9 +12,9 @@
 //   double costOf(const SharedBrick& brick, int tile) const;      in any unit, 0 if it is not known. In a
 //                                  MixedParallelLoop, a rank first renders what costs more than twice the mean, so that
 //                                  no worker is left with it at the end.
-// MixedParallelLoop calls both on the thread that is in start(). OrderedLoop calls operator() from several workers at
-// once as well. An owner without plan() may be asked about pass 0 more than once. All ranks must get the same answers.
-// If it picks a rank that does not hold the brick, the frame fails.
+// MixedParallelLoop calls all of them on the thread that is in start(). OrderedLoop calls operator() from several
+// workers at once as well. An owner without plan() may be asked about pass 0 more than once. All ranks must get the
+// same answers. If it picks a rank that does not hold the brick, the frame fails.
 #pragma once
 
 #include <dfb/base/detect.hpp>
