@@ -340,12 +340,14 @@ public:
         Mailbox& mailbox_;
     };
 
-    // Waits until ready(), which must not take a lock that a caller of notify() holds. Moves messages itself if no
-    // other thread does. Returns false if `deadline` passes before. Throws TransportError.
+    // Waits until ready() was true once: another thread may take what this one has waited for. It must not take a lock
+    // that a caller of notify() holds. Moves messages itself if no other thread does. Returns false if `deadline`
+    // passes before. Throws TransportError.
     bool wait(FunctionRef<bool()> ready, std::optional<Clock::time_point> deadline = std::nullopt)
     {
         const TraceSpan span(trace_, TraceEvent::Kind::Wait, epoch_);
-        const auto over = [&] { return failed() || ready(); };
+        bool isReady = false;
+        const auto over = [&] { return isReady || failed() || (isReady = ready()); };
         const auto late = [&] { return deadline && Clock::now() >= *deadline; };
         waitAwake(over);
         const Connection::Hurry hurry(*connection_);
@@ -393,7 +395,7 @@ public:
                 lock.lock();
             }
         }
-        const bool isReady = ready();
+        isReady = isReady || ready();
         lock.unlock();
         if (!isReady)
             connection_->throwIfFailed();

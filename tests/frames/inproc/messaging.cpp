@@ -799,6 +799,22 @@ TEST_CASE("Where there is no memory for a message, the connection fails on all r
         CHECK(has(text, std::bad_alloc().what()));
 }
 
+TEST_CASE("A thread that waits returns also if another thread takes what has come", "[messaging]")
+{
+    for (const auto progress : {dfb::Progress::Thread, dfb::Progress::Caller}) {
+        bool hasCome = false;
+        runOn(std::make_shared<Board>(), 1, [&](const auto& communicator) {
+            dfb::NetworkConfig options;
+            options.progress = progress;
+            NoMemory object(dfb::connect<BoardTransport>(communicator, options));
+            bool isThere = true; // when it looks for the first time
+            const auto limit = dfb::detail::Mailbox::Clock::now() + std::chrono::seconds(1);
+            hasCome = object.mailbox().wait([&] { return std::exchange(isThere, false); }, limit);
+        });
+        CHECK(hasCome);
+    }
+}
+
 TEST_CASE("A reduction's result is malformed where nothing was given to it", "[messaging]")
 {
     dfb::ReductionTable leaf(1, 2, [](int, const dfb::ReductionKey&, bool, const dfb::detail::SmallBytes&) {});
