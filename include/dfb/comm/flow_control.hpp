@@ -89,11 +89,12 @@ public:
         }
     }
 
-    // Whether nothing waits for credit.
+    // Whether every message that was given to send() has been transmitted or dropped.
     bool allSent() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        return std::all_of(peers_.begin(), peers_.end(), [](const auto& p) { return p.second.out.queue.empty(); });
+        return transmitting_ == 0
+               && std::all_of(peers_.begin(), peers_.end(), [](const auto& p) { return p.second.out.queue.empty(); });
     }
 
     // ---- the sender's side
@@ -101,26 +102,15 @@ public:
     // Transmits the message, or keeps it until there is credit. Never blocks.
     void send(int destination, Buffer&& message)
     {
-        Request request;
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (matters_ && !matters_(message))
-                return;
-            Outgoing& out = peerOf(destination).out;
-            underWay_ += message.size();
-            if (!out.queue.empty() || out.sent + message.size() > out.granted) {
-                out.queue.push(std::move(message));
-                if (out.asks())
-                    return;
-                request = requestOf(out);
-            } else {
-                out.sent += message.size();
-            }
-        }
-        if (request.first > 0)
-            callbacks_.request(destination, request);
-        else
-            callbacks_.transmit(destination, std::move(message));
+        std::unique_lock<std::mutex> lock(mutex_);
+        if (matters_ && !matters_(message))
+            return;
+        Outgoing& out = peerOf(destination).out;
+        underWay_ += message.size();
+        if (out.queue.empty() && out.sent + message.size() <= out.granted)
+            return transmit(destination, std::move(message), lock);
+        out.queue.push(std::move(message));
+        ask(destination, lock);
     }
 
     // Bytes that were given to send() and that, as far as is known, no receiver has taken out of its inbox.
@@ -158,17 +148,10 @@ public:
         if (credit.consumed > out.consumed)
             underWay_ -= credit.consumed - std::exchange(out.consumed, credit.consumed);
         while (!out.queue.empty() && out.sent + out.queue.front().size() <= out.granted) {
-            Buffer message = out.queue.pop();
-            out.sent += message.size();
-            lock.unlock();
-            callbacks_.transmit(from, std::move(message));
+            transmit(from, out.queue.pop(), lock);
             lock.lock();
         }
-        if (out.queue.empty() || out.asks())
-            return;
-        const Request request = requestOf(out);
-        lock.unlock();
-        callbacks_.request(from, request);
+        ask(from, lock);
     }
 
     // ---- the receiver's side
@@ -260,7 +243,31 @@ private:
 
     Peer& peerOf(int rank) { return peers_.try_emplace(rank, allowance_).first->second; }
 
-    // Asks for the first message that waits, and for as many of the next as fit in a quarter of the pool with it.
+    // Transmits a message, which there is credit for. Releases the lock.
+    void transmit(int destination, Buffer&& message, std::unique_lock<std::mutex>& lock)
+    {
+        peerOf(destination).out.sent += message.size();
+        ++transmitting_; // under the lock, so that allSent() always sees the message
+        struct End {
+            std::atomic<int>& count;
+            ~End() { --count; }
+        } end{transmitting_};
+        lock.unlock();
+        callbacks_.transmit(destination, std::move(message));
+    }
+
+    // Asks for credit if messages wait and no request is out. Releases the lock.
+    void ask(int destination, std::unique_lock<std::mutex>& lock)
+    {
+        Outgoing& out = peerOf(destination).out;
+        if (out.queue.empty() || out.asks())
+            return;
+        const Request request = requestOf(out);
+        lock.unlock();
+        callbacks_.request(destination, request);
+    }
+
+    // A request for the first message that waits, and for as many of the next as fit in a quarter of the pool with it.
     Request requestOf(Outgoing& out) const
     {
         Request request;
@@ -325,6 +332,7 @@ private:
     std::size_t free_; // bytes of the half that is granted on request which are in nobody's extraOf()
     // For each rank, from when it was first met:
     std::unordered_map<int, Peer> peers_;
+    std::atomic<int> transmitting_{0}; // messages that are with the callback
     Fifo<int> asking_;
     Fifo<std::pair<int, Credit>> grants_; // not yet sent to their ranks
     std::size_t inboxBytes_ = 0;

@@ -691,6 +691,23 @@ TEST_CASE("drop() forgets what waits, or what nobody has asked for, and keeps no
     CHECK(link.flow->underWay() == 250);
 }
 
+TEST_CASE("A message counts as sent when the callback has it, not when it leaves the queue", "[flow]")
+{
+    std::unique_ptr<FlowControl> flow;
+    std::vector<bool> allSent; // as the callback sees it for each message
+    flow = std::make_unique<FlowControl>(
+        2, 400,
+        FlowControl::Callbacks{[&](int, Buffer&&) { allSent.push_back(flow->allSent()); },
+                               [](int, const FlowControl::Request&) {}, [](int, const FlowControl::Credit&) {}});
+    const auto memory = dfb::MemoryPool::create();
+    for (int i = 0; i < 5; ++i)
+        flow->send(1, memory->acquire(50));
+    CHECK_FALSE(flow->allSent()); // there is credit for four
+    flow->credited(1, {400, 200});
+    CHECK(allSent == std::vector<bool>(5, false));
+    CHECK(flow->allSent());
+}
+
 TEST_CASE("A receiver answers in the order of asking, the whole or the first message, never more than it has", "[flow]")
 {
     struct Told {
