@@ -263,7 +263,7 @@ void jobs(fuzz::Input in)
             const d::JobRequest request{in.take<std::int64_t>(), in.take<std::int32_t>(), 0};
             refused(
                 [&] {
-                    const d::JobRange range = server.give(request, 3);
+                    const d::JobRange range = server.give(request, 1, 3);
                     fuzz::require(range.begin >= 0 && range.begin <= range.end && range.end <= request.count,
                                   "what is handed out is there");
                 },

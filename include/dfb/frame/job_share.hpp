@@ -37,25 +37,30 @@ public:
     void newFrame()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        askedOf_ = count_ = -1;
+        firstToAsk_ = -1;
+        count_ = -1;
         mine_ = ahead_ = {};
         asked_ = exhausted_ = false;
     }
 
-    // On the rank that hands out jobs: returns the next range. Throws Error (MalformedMessage, or Disagreement if
-    // another rank asked for another number of jobs).
-    JobRange give(const JobRequest& request, int rankCount)
+    // On the rank that hands out jobs: returns the next range, for rank `to`. Throws Error (MalformedMessage, or
+    // Disagreement if another rank asked for another number of jobs).
+    JobRange give(const JobRequest& request, int to, int rankCount)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (request.count < 0 || request.workers < 1)
             failMalformed("a request for jobs that cannot be", 1,
                           std::min(request.count, std::int64_t{request.workers}));
-        if (askedOf_ >= 0 && request.count != askedOf_)
-            throw Error(errorInfo(ErrorKind::Disagreement,
-                                  printed("nextJob() of %lld jobs on one rank and of %lld on another",
-                                          static_cast<long long>(askedOf_), static_cast<long long>(request.count))));
-        if (std::exchange(askedOf_, request.count) < 0)
+        if (firstToAsk_ < 0) {
+            firstToAsk_ = to;
+            askedOf_ = request.count;
             next_ = fixedPart(request.count);
+        } else if (request.count != askedOf_) {
+            throw Error(
+                errorInfo(ErrorKind::Disagreement, printed("nextJob() of %lld jobs on rank %d and of %lld on rank %d",
+                                                           static_cast<long long>(askedOf_), firstToAsk_,
+                                                           static_cast<long long>(request.count), to)));
+        }
         const std::int64_t left = request.count - next_;
         const std::int64_t size =
             std::min(left, std::max<std::int64_t>(request.workers, left / (2 * static_cast<std::int64_t>(rankCount))));
@@ -108,10 +113,10 @@ private:
     static std::int64_t fixedPart(std::int64_t count) { return count / 2; }
 
     mutable std::mutex mutex_;
-    std::int64_t askedOf_ = -1; // the number of all jobs, from requests; -1: nobody has asked yet
-    std::int64_t next_ = 0;     // to hand out
-    std::int64_t count_ = -1;   // of all jobs; -1: nothing was taken yet
-    JobRange mine_, ahead_;     // not taken yet; those ahead come after the others
+    int firstToAsk_ = -1;                 // the rank; -1: nobody has asked yet
+    std::int64_t askedOf_ = 0, next_ = 0; // the number of all jobs, from requests; the next to hand out
+    std::int64_t count_ = -1;             // of all jobs; -1: nothing was taken yet
+    JobRange mine_, ahead_;               // not taken yet; those ahead come after the others
     bool asked_ = false, exhausted_ = false;
 };
 
@@ -154,7 +159,7 @@ public:
             if (mailbox_.rank() != server_)
                 failMalformed("a request for jobs to a rank that hands out none", server_, mailbox_.rank());
             mailbox_.sendBody(source, MessageKind::Jobs, frame_.number(),
-                              share_.give(bodyOf<JobRequest>(message), mailbox_.size()));
+                              share_.give(bodyOf<JobRequest>(message), source, mailbox_.size()));
             return;
         }
         if (header.kind != MessageKind::Jobs || source != server_)
@@ -177,7 +182,7 @@ private:
         if (asks) {
             const JobRequest request{count, mailbox_.executor().concurrency(), 0};
             if (mailbox_.rank() == server_)
-                outcome_.guarded([&] { receiveMine(share_.give(request, mailbox_.size())); });
+                outcome_.guarded([&] { receiveMine(share_.give(request, server_, mailbox_.size())); });
             else
                 mailbox_.sendBody(server_, MessageKind::JobRequest, frame_.number(), request);
         }

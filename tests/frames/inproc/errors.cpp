@@ -308,8 +308,8 @@ TEST_CASE("Ranks that call nextJob() for different numbers of jobs are told so",
     INFO(joined(texts));
     CHECK(texts[0] == texts[1]);
     CHECK(has(texts[0], "ranks disagree"));
-    CHECK((has(texts[0], "nextJob() of 10 jobs on one rank and of 20 on another")
-           || has(texts[0], "nextJob() of 20 jobs on one rank and of 10 on another")));
+    CHECK((has(texts[0], "nextJob() of 10 jobs on rank 0 and of 20 on rank 1")
+           || has(texts[0], "nextJob() of 20 jobs on rank 1 and of 10 on rank 0")));
 }
 
 TEST_CASE("Frame parameters that cannot be are refused", "[errors]")

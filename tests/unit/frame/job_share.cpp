@@ -44,7 +44,7 @@ TEST_CASE("Shares of jobs shrink with the work that is left, and no job is hande
     share.newFrame();
     std::int64_t next = 50, last = 50;
     for (;;) {
-        const auto range = share.give({100, 2, 0}, 2);
+        const auto range = share.give({100, 2, 0}, 0, 2);
         CHECK(range.begin == next);
         CHECK(range.count() <= last);
         if (range.count() == 0)
