@@ -13,6 +13,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <memory>
 #include <mutex>
 #include <utility>
@@ -59,7 +60,8 @@ public:
     const TileHeader& header() const noexcept { return header_; }
 
     // Adds a segment to pixel (x, y) of the image, which is in the tile's region. Segments of one pixel come in any
-    // order and should not overlap. A segment without colour and alpha is left out. Nobody checks x and y.
+    // order and should not overlap; those of equal depth keep the order of these calls. A segment without colour and
+    // alpha is left out. Nobody checks x and y.
     void add(int x, int y, const Segment& segment)
     {
         if (segment.rgba == std::array<float, 4>{})
@@ -110,10 +112,10 @@ public:
     }
 
 private:
-    // A depth of NaN counts as farthest.
-    static bool nearer(const Segment& a, const Segment& b)
+    static bool nearer(const Segment& a, const Segment& b) { return depthOf(a) < depthOf(b); }
+    static float depthOf(const Segment& s) // NaN counts as infinity, as in tile operations
     {
-        return a.depth < b.depth || (std::isnan(b.depth) && !std::isnan(a.depth));
+        return std::isnan(s.depth) ? std::numeric_limits<float>::infinity() : s.depth;
     }
 
     // Doubles the room of each pixel.

@@ -4,6 +4,7 @@
 
 #include <limits>
 #include <memory>
+#include <utility>
 #include <vector>
 
 TEST_CASE("A deep tile keeps 1 to 65535 segments a pixel")
@@ -40,7 +41,7 @@ TEST_CASE("The error bound of a deep tile holds for alpha above 1")
     }
 }
 
-TEST_CASE("A segment of depth NaN is the farthest, whenever it comes")
+TEST_CASE("A segment of depth NaN is sorted as one at infinity, whenever it comes")
 {
     const float nan = std::numeric_limits<float>::quiet_NaN();
     const dfb::Segment first{{0.9f, 0, 0, 0.9f}, 1, 1}, second{{0, 0.3f, 0, 0.3f}, 2, 2},
@@ -58,5 +59,22 @@ TEST_CASE("A segment of depth NaN is the farthest, whenever it comes")
             deep.writeLayer(i, *layer);
             CHECK(layer->color[i] > 0);
         }
+    }
+}
+
+TEST_CASE("Segments of equal depth keep their order, and NaN equals infinity")
+{
+    const float nan = std::numeric_limits<float>::quiet_NaN(), infinity = std::numeric_limits<float>::infinity();
+    for (const auto& [first, second] : {std::pair{2.0f, 2.0f}, {nan, infinity}, {infinity, nan}}) {
+        dfb::DeepTile deep(2);
+        dfb::TileHeader header;
+        header.region = {0, 0, 1, 1};
+        deep.reset(header);
+        deep.add(0, 0, {{0.5f, 0, 0, 0.5f}, first, first});
+        deep.add(0, 0, {{0, 0.5f, 0, 0.5f}, second, second});
+        auto front = std::make_unique<dfb::Tile<dfb::allChannels, 8>>();
+        front->clear();
+        deep.writeLayer(0, *front);
+        CHECK(front->color[0] == 0.5f);
     }
 }
