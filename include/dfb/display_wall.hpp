@@ -72,8 +72,8 @@ public:
     // sent all of it, because it failed or was partial, or a display has dropped it. MalformedMessage: a part of it
     // cannot be right. The displays then keep their picture. Throws TransportError if the connection fails. Throws
     // InvalidArgument, on this rank alone, on a thread that may not call MPI, or for a frame that is not later than the
-    // last or that no rank can have begun. A number that is up to 16 too large is not noticed; earlier frames can then
-    // no longer be finished.
+    // last or that no rank can have begun. A number that is too large by at most 16 is not noticed: the frames before
+    // it can then no longer be finished.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before

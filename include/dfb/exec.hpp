@@ -74,8 +74,8 @@ public:
     // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Any thread may call it,
     // several at once. Waits until all these calls have returned. If a worker of a ThreadExecutor calls it, that worker
     // alone runs the loop; with a TbbExecutor others may take part. Rethrows the first exception of a body; after it no
-    // other body begins. If the calling thread takes no part in the loop, it calls `meanwhile` every millisecond, which
-    // must not throw. With a ThreadExecutor, it also runs tasks if some still wait after a millisecond.
+    // other body begins. A calling thread that runs no bodies calls meanwhile() every millisecond, which must not
+    // throw. With a ThreadExecutor that thread also runs tasks that have waited for a millisecond.
     void parallelFor(std::size_t count, detail::FunctionRef<void(std::size_t)> body,
                      const std::function<void()>& meanwhile = nullptr)
     {
@@ -279,7 +279,7 @@ private:
 // iterations, on threads that call setTile() or poll(), and on a thread that waits for a frame. For ranks that have one
 // core each. With Progress::Caller as well, the library works only while the program calls it, and other ranks may wait
 // for that. Framebuffers whose frames are open at the same time must share one executor. A rank that waits in one frame
-// then runs the tasks of all, so that other ranks find room for their messages. Make and destroy framebuffers while no
+// then runs the tasks of all, so that other ranks find room for their messages. Make and destroy connections while no
 // frame is open: a rank that waits there runs no tasks.
 class CallerExecutor final : public Executor {
 public:

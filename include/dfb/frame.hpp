@@ -100,9 +100,9 @@ struct FrameConfig {
     int passes = 1;
     // If not null, it has the samples of each tile, by the tile's index, and replaces `passes`; see sampling.hpp. A
     // tile without samples is not rendered, and the image keeps its pixels from the last frame, which must not have
-    // failed. With keepsState that frame must have had the same accumulationId. Without keepsState the samples of a
-    // tile begin with 0, tiles without samples need framesInFlight 1 and a pixel operation that is pointwise, and in
-    // the first frame and after resize() they show the background.
+    // failed. With keepsState: that frame must have had the same accumulationId. Without: the samples of a tile begin
+    // with 0. Tiles without samples then need framesInFlight 1 and a pixel operation that is pointwise; in the first
+    // frame and after resize() they show the background.
     SamplePlan samples;
     // For an ErrorBudget or HalfLevel: the most inputs that a pixel has in a pass. 0: not known, counts as 65536.
     // ImageParallelLoop, MixedParallelLoop, OrderedLoop and ImageCompositor set it; the other loops do not.
@@ -133,8 +133,8 @@ struct FrameConfig {
     // True: a frame that fails still gives the tiles that were finished. end() then sets FrameReport::failure in place
     // of a FrameError, and DistributedFrameBuffer::isComplete() tells which tiles there are. If a renderer or an
     // operation throws, or inputs of a tile contradict each other, only that tile is lost. A tile with a missing input
-    // is given up when nothing is under way any more, or after `timeout`. A message that cannot be read ends the frame
-    // at once, unless there is a time-out. If ranks disagree about these parameters, end() still throws.
+    // is given up when nothing is under way any more, or after `timeout`. If a message cannot be read, the frame ends
+    // at once; with a `timeout` it goes on until then. If ranks disagree about these parameters, end() still throws.
     bool allowPartial = false;
 };
 

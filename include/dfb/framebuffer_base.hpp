@@ -98,9 +98,9 @@ public:
 
     // Calls body() once for each worker of the executor, on several at once, and waits for all calls. forEachTile()
     // of one tile within the body runs on the worker that calls it. If the body throws, the frame fails as guard()
-    // says. Only the thread that began the frame may call it, and not from a task. Below MPI_THREAD_SERIALIZED this
-    // thread moves messages meanwhile; so with an executor in which it takes part, its body must not end before the
-    // jobs do.
+    // says. Only the thread that began the frame may call it, and not from a task. Below MPI_THREAD_SERIALIZED only
+    // this thread moves messages. If the executor runs a body() on it, as a TbbExecutor does, that body must go on
+    // until nextJob() returns -1: else the others wait for ever.
     void forEachWorker(detail::FunctionRef<void()> body);
 
     // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. Use it for

@@ -46,9 +46,9 @@ namespace detail {
 // the codec and the cores.
 //
 // Ranks that get the same times make the same choice. At first, frames with and without compression take turns. Then
-// the faster way is used. The other is tried again more and more seldom, and when some frames, one after the other, are
-// much slower or faster than usual: more and more of them, as frames whose times vary need no trial. If it seems faster
-// by a tenth, both take turns again.
+// the faster way is used. The other is tried again more and more seldom, and also after some frames in a row that are
+// much slower or faster than usual. Each such trial doubles their number, as times that vary need no trial. If it seems
+// faster by a tenth, both take turns again.
 class CompressionTrial {
 public:
     // Whether the next frame is to be compressed.

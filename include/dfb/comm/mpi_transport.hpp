@@ -52,10 +52,11 @@ public:
 
     // Collective over `communicator`. Waits for all ranks. Throws InvalidArgument for MPI_COMM_NULL or an
     // intercommunicator. Throws TransportError if MPI is not initialised, is finalised, or is another one than that of
-    // the headers, and below MPI_THREAD_SERIALIZED on any thread but the one that initialised it. Throws TransportError
-    // on all ranks if they were built with different packet formats, or if one of them cannot make its transport; the
-    // error then has that rank and the reason, such as that `progress` is Thread and MPI is below MPI_THREAD_MULTIPLE
-    // there. But if a collective of MPI fails on one rank, or there is no memory for its result, the other ranks wait.
+    // the headers, and below MPI_THREAD_SERIALIZED on any thread but the one that initialised it: the other ranks then
+    // wait. Throws TransportError on all ranks if they were built with different packet formats, or if one of them
+    // cannot make its transport; the error then has that rank and the reason, such as that `progress` is Thread and MPI
+    // is below MPI_THREAD_MULTIPLE there. But if a collective of MPI fails on one rank, or there is no memory for its
+    // result, the other ranks wait.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : onlyThread_(onlyThread()),
           noFinalize_(progress != Progress::Caller && detail::mpiLevel() == MPI_THREAD_MULTIPLE),

@@ -19,8 +19,8 @@
 //   bool quiet() const;                         any thread. Whether nothing waits to be sent: all messages will then
 //                                               arrive even if this rank does not poll any more
 //   void nap(std::chrono::nanoseconds limit);   on the thread that polls. Sleeps until there is something to send,
-//                                               interrupt() is called, or `limit` has passed, or until soon after
-//                                               that. Better if it also ends when a message comes
+//                                               interrupt() is called, or `limit` has passed. May end a little
+//                                               later. Better if it also ends when a message comes
 //   void interrupt();                           any thread, also within a call of the handler. Ends the nap under way,
 //                                               or else the next one
 //   void stop(bool orderly);                    once, after start(), when no thread is in another member. Afterwards
@@ -85,8 +85,8 @@ enum class Progress {
     Caller
 };
 
-// Gets the messages that a transport delivers. Its members are quick and never block. Any thread may call them. They
-// call nothing of the transport but interrupt().
+// Gets the messages that a transport delivers. Its members are quick and never block. Any thread may call receive(),
+// fail() and failed(); these call nothing of the transport but interrupt().
 class TransportHandler {
 public:
     virtual void receive(int source, Buffer&& message) = 0;

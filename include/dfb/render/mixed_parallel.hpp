@@ -7,13 +7,15 @@
 // and, if it decides about all pairs of brick and tile together,
 //   void plan(const SharedWorld&, const std::vector<BrickInTile>&, const std::vector<int>& passes);
 //                                  called once a frame, before operator(): with all pairs, and the number of passes of
-//                                  each. FrameReport::figures then has the cost of each pair, for the next plan.
+//                                  each. FrameReport::figures then has the cost of each pair that was rendered, the
+//                                  sum over its passes, for the next plan.
 // and, if it knows costs,
 //   double costOf(const SharedBrick& brick, int tile) const;      in any unit, 0 if it is not known. In a
-//                                  MixedParallelLoop, a rank first renders what costs more than twice the mean, so that
-//                                  no worker is left with it at the end.
+//                                  MixedParallelLoop, a rank first renders the passes that cost more than twice the
+//                                  mean of its own, so that no worker is left with one at the end.
 // MixedParallelLoop calls all of them on the thread that is in start(). OrderedLoop calls operator() from several
-// workers at once as well. An owner without plan() may be asked about pass 0 more than once. All ranks must get the
+// workers at once as well. It may be asked about pass 0 more than once, except by a MixedParallelLoop if it has
+// plan(). All ranks must get the
 // same answers. If it picks a rank that does not hold the brick, the frame fails.
 #pragma once
 

@@ -45,7 +45,8 @@ struct SamplingConfig {
 //       sampler.update(loop.render(renderTile, sampler.next()));
 //
 // Call reset(), not update(), after a frame that throws FrameError or is partial (FrameReport::failure): the
-// accumulated samples are lost. After resize() make a new sampler. One thread at a time may use it. Its members send nothing and wait for nothing.
+// accumulated samples are lost. After resize() make a new sampler. One thread at a time may use it. Its members send
+// nothing and wait for nothing.
 class AdaptiveSampler {
 public:
     // Throws InvalidArgument unless firstSamples is 2 or more, maxSamples at least firstSamples, frameSamples 1 or
@@ -97,8 +98,8 @@ public:
         decide();
     }
 
-    // samplesTaken(): the samples of all pixels so far. samplesSaved(): how many fewer these are than if each tile had
-    // as many as the tile with the most.
+    // samplesTaken(): the samples of all pixels so far. samplesSaved(): how many more they would be if each tile had as
+    // many samples as the tile with the most.
     std::int64_t samplesTaken() const
     {
         std::int64_t sum = 0;
