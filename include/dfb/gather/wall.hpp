@@ -69,17 +69,18 @@ public:
         mailbox_->enterEpoch(frame); // gives up if a neighbour has left: it does not tell what it has sent
         tellSent(frame);
         mailbox_->wait([&] { return isOver(frame); }, deadline);
-        const std::optional<ErrorInfo> mine = whatIsMissing(frame);
+        std::shared_ptr<Pictures> pictures; // kept: store() may drop them for those of later frames
+        const std::optional<ErrorInfo> mine = whatIsMissing(frame, pictures);
         Bytes missing; // empty if nothing is missing
         if (mine)
             detail::put(missing, *mine);
         const Bytes all = mailbox_->reduce(missing, [](const Bytes& a, const Bytes& b) { return a.empty() ? b : a; });
         const std::lock_guard<std::mutex> lock(mutex_);
-        if (const auto done = coming_.find(frame); done != coming_.end() && all.empty())
-            for (auto& [display, picture] : *done->second)
-                std::swap(shown_.at(display), picture.image);
-        if (all.empty())
+        if (all.empty()) {
+            for (auto& [display, image] : shown_)
+                std::swap(image, pictures->at(display).image);
             shownFrame_ = frame;
+        }
         mailbox_->reductions().forget(SentPixels, frame);
         coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also parts of failed frames
         sent_.erase(sent_.begin(), sent_.upper_bound(frame));
@@ -403,9 +404,12 @@ private:
                   });
     }
 
-    std::optional<ErrorInfo> whatIsMissing(std::int64_t frame)
+    // Sets `pictures` to those that have come.
+    std::optional<ErrorInfo> whatIsMissing(std::int64_t frame, std::shared_ptr<Pictures>& pictures)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
+        if (const auto found = coming_.find(frame); found != coming_.end())
+            pictures = found->second;
         ErrorInfo info = errorInfo(ErrorKind::MalformedMessage, error_);
         info.frame = frame;
         if (!error_.empty())

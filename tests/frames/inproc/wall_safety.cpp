@@ -4,14 +4,18 @@
 #include "catch.hpp"
 #include "random_scene.hpp"
 
+#include <dfb/comm/mailbox.hpp>
+
 #include <atomic>
 #include <chrono>
 #include <cstdint>
 #include <cstring>
 #include <functional>
+#include <future>
 #include <memory>
 #include <optional>
 #include <string>
+#include <thread>
 #include <vector>
 
 namespace wall_safety_cases {
@@ -237,6 +241,56 @@ TEST_CASE("A frame that no rank can have begun is refused, and the wall goes on"
     CHECK(has(texts[0], "frame 1000, which no rank can have begun"));
     CHECK(has(texts[1], "frame 1000, which no rank can have begun"));
     CHECK(after == fine);
+}
+
+TEST_CASE("A frame that finish() has found complete is shown, even if parts of 16 later ones come meanwhile", "[wall]")
+{
+    const auto board = std::make_shared<Board>();
+    std::promise<void> isComplete; // on rank 1, which then waits for rank 0
+    board->inspect = [&](int from, int, const MessageHeader& header, dfb::Buffer& message) {
+        if (from == 1 && header.receiver == wallAddress && header.kind == MessageKind::ReduceUp && header.number == 2
+            && dfb::detail::loadAs<std::uint32_t>(message.data() + body) == dfb::detail::Mailbox::ownScope)
+            isComplete.set_value();
+        return What::Pass;
+    };
+    std::vector<std::string> texts(2);
+    int red = -1;
+    board::runOn(board, 2, [&](const BoardTransport::Communicator& communicator) {
+        const auto connection = dfb::connect<BoardTransport>(communicator);
+        dfb::DisplayWall wall(connection, {1, 1, 16, 16, 0, 0, {1}}, dfb::OutputFormat::RGBA8);
+        FrameBuffer fb(connection, wall.frameBufferConfig(), {&wall});
+        const dfb::World noBricks;
+        auto renderUpTo = [&, number = 0](int last) mutable {
+            while (number < last) {
+                dfb::FrameConfig params;
+                params.background = {static_cast<float>(++number) / 255, 0, 0, 1};
+                dfb::DataParallelLoop(fb, noBricks)
+                    .render(
+                        scene::FlatCamera(), [](const dfb::Brick&, auto&) {}, params);
+            }
+        };
+        const auto rank = static_cast<std::size_t>(fb.rank());
+        texts[rank] = outcomeOf([&] {
+            renderUpTo(1);
+            wall.finish(1);
+            renderUpTo(2);
+            std::thread other; // for finish(): it waits for rank 0, which comes there later
+            if (rank == 1) {
+                other = std::thread([&] { texts[1] = outcomeOf([&] { wall.finish(2); }); });
+                isComplete.get_future().wait();
+            }
+            renderUpTo(20);
+            if (rank == 0)
+                wall.finish(2);
+            else
+                other.join();
+        });
+        if (rank == 1)
+            red = wall.image(0).rgba8()[0];
+    });
+    INFO(joined(texts));
+    CHECK(texts == fine);
+    CHECK(red == 2);
 }
 
 TEST_CASE("Ranks with different pools make no wall", "[wall]")
