@@ -221,6 +221,13 @@ public:
     // One entry, which ends when this is destroyed. Null: none.
     using Inside = std::unique_ptr<OpenFrame, Leave>;
 
+    // Whether no thread is inside.
+    bool isIdle() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return inside_ == 0;
+    }
+
     // Enters for work that is not a message. Null: frame `number` is not open, so the work must not go on.
     Inside enter(std::int64_t number)
     {

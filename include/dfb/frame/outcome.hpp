@@ -367,10 +367,13 @@ private:
         return givesUpAt_ ? std::min(next, *givesUpAt_) : next;
     }
 
-    // If a frame failed and may be partial, tiles that other ranks have finished may still be on their way.
+    // If a frame failed and may be partial, tiles that other ranks have finished may still be on their way. This rank
+    // may still be about to send some, and takes credit for them only while the frame is open.
     void waitForFinishedTiles()
     {
-        const auto areThere = [this] { return tiles_.gather().complete() && mailbox_.flow().allSent(); };
+        const auto areThere = [this] {
+            return tiles_.gather().complete() && frame_.isIdle() && mailbox_.flow().allSent();
+        };
         if (!hasTimeout()) // a message that could not be read does not come again
             mailbox_.wait([&] { return areThere() || frame_.isDamaged() || tiles_.gather().hasLost(); });
         mailbox_.wait(areThere, Clock::now() + (hasTimeout() ? terms_.timeout() : std::chrono::seconds(2)));
