@@ -10,6 +10,7 @@
 #include <cstddef>
 #include <functional>
 #include <thread>
+#include <utility>
 
 DFB_NAMESPACE_BEGIN
 
@@ -53,12 +54,27 @@ private:
 
     void run(std::size_t count, const std::function<void(std::size_t)>& body, const std::function<void()>&) override
     {
+        const auto inBody = [&](std::size_t i) {
+            const bool before = std::exchange(isInBody(), true);
+            body(i);
+            isInBody() = before;
+        };
+        const auto loop = [&] { tbb::parallel_for(std::size_t{0}, count, inBody, tbb::simple_partitioner()); };
         arena_.execute([&] {
             if (count == 1)
-                body(0); // a loop within a loop, as a rule: quicker, and not on another thread
+                inBody(0); // a loop within a loop, as a rule: quicker, and not on another thread
+            else if (isInBody() || isInTask())
+                tbb::this_task_arena::isolate(loop); // a thread that waits for this loop begins no other body meanwhile
             else
-                tbb::parallel_for(std::size_t{0}, count, body, tbb::simple_partitioner());
+                loop();
         });
+    }
+
+    // Whether the calling thread is in a loop's body.
+    static bool& isInBody() noexcept
+    {
+        static thread_local bool isInBody = false;
+        return isInBody;
     }
 
     tbb::task_arena arena_;

@@ -266,9 +266,9 @@ public:
             ++batch->writers;
             ++sent_.tiles;
         }
+        record_.write(plan, record); // before any call of the codec, which may run other work on this thread
         if (full)
             sendBatch(std::move(full));
-        record_.write(plan, record);
         bool isLast = false;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
