@@ -198,7 +198,7 @@ private:
     void run(std::size_t count, const std::function<void(std::size_t)>& body,
              const std::function<void()>& meanwhile) override
     {
-        if (current() == this || resting_ > 0) {
+        if (isWorker() || resting_ > 0) {
             for (std::size_t i = 0; i < count; ++i)
                 body(i);
             return;
@@ -220,19 +220,20 @@ private:
             if (loopDone_.wait_for(lock, std::chrono::milliseconds(1), isDone))
                 return;
             lock.unlock();
-            ThreadExecutor* const before = std::exchange(current(), this);
-            do {
-                if (meanwhile)
-                    meanwhile();
-            } while (helps && help());
-            current() = before;
+            {
+                const Role role(*this);
+                do {
+                    if (meanwhile)
+                        meanwhile();
+                } while (helps && help());
+            }
             lock.lock();
         }
     }
 
     void work()
     {
-        current() = this;
+        const Role role(*this);
         std::unique_lock<std::mutex> lock(mutex_);
         for (;;) {
             wakeUp_.wait(lock, [this] { return stop_ || signals_ > 0 || !loops_.empty(); });
@@ -258,11 +259,30 @@ private:
         }
     }
 
-    // The executor whose worker this thread is.
-    static ThreadExecutor*& current()
+    // For as long as it lives, the thread that has made it is a worker: of several executors if a worker of one waits
+    // for a loop of another.
+    struct Role {
+        const ThreadExecutor& executor;
+        const Role* outer;
+
+        explicit Role(const ThreadExecutor& its) : executor(its), outer(std::exchange(innermost(), this)) {}
+        ~Role() { innermost() = outer; }
+        Role(const Role&) = delete;
+        Role& operator=(const Role&) = delete;
+
+        static const Role*& innermost()
+        {
+            static thread_local const Role* role = nullptr;
+            return role;
+        }
+    };
+
+    bool isWorker() const // whether the calling thread is one
     {
-        static thread_local ThreadExecutor* executor = nullptr;
-        return executor;
+        const Role* role = Role::innermost();
+        while (role && &role->executor != this)
+            role = role->outer;
+        return role != nullptr;
     }
 
     std::mutex mutex_;

@@ -4,6 +4,8 @@
 #include <dfb/exec.hpp>
 #if defined(DFB_HAS_TBB)
 #include <dfb/tbb_executor.hpp>
+
+#include <tbb/global_control.h>
 #endif
 
 #include <algorithm>
@@ -11,6 +13,7 @@
 #include <chrono>
 #include <condition_variable>
 #include <cstddef>
+#include <cstdint>
 #include <functional>
 #include <memory>
 #include <mutex>
@@ -19,6 +22,7 @@
 #include <stdexcept>
 #include <string>
 #include <thread>
+#include <utility>
 #include <vector>
 
 namespace exec_cases {
@@ -294,5 +298,63 @@ TEST_CASE("A thread that waits for a loop runs tasks while the workers are busy"
     REQUIRE(hasRun);
     CHECK(runner == std::this_thread::get_id());
 }
+
+TEST_CASE("A worker of one ThreadExecutor that runs a task of another may run loops of both", "[executor]")
+{
+    dfb::ThreadExecutor a(1), b(1);
+    std::atomic<int> hasRun{0};
+    a.parallelFor(1, [&](std::size_t) {
+        b.parallelFor(1, [&](std::size_t) { // meanwhile a's worker runs tasks of b
+            b.submit([&] { a.parallelFor(2, [&](std::size_t) { ++hasRun; }); });
+            const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(10);
+            while (hasRun < 2 && std::chrono::steady_clock::now() < limit)
+                std::this_thread::yield();
+        });
+    });
+    CHECK(hasRun == 2);
+}
+
+#if defined(DFB_HAS_TBB)
+TEST_CASE("A TbbExecutor begins no body of a loop on a thread that is in one, while that waits for an inner loop",
+          "[executor]")
+{
+    const tbb::global_control threads(tbb::global_control::max_allowed_parallelism, 6);
+    dfb::TbbExecutor executor(6);
+    static thread_local bool isInside = false;
+    std::atomic<int> nested{0};
+    std::atomic<std::int64_t> sum{0};
+    for (int round = 0; round < 20; ++round)
+        executor.parallelFor(64, [&](std::size_t) {
+            nested += std::exchange(isInside, true);
+            executor.parallelFor(16, [&](std::size_t i) {
+                std::this_thread::yield();
+                sum += static_cast<std::int64_t>(i);
+            });
+            isInside = false;
+        });
+    CHECK(nested == 0);
+    CHECK(sum == 20 * 64 * 120);
+}
+
+TEST_CASE("With a TbbExecutor, a thread that waits for a loop runs tasks while the other is in a long body",
+          "[executor]")
+{
+    const tbb::global_control threads(tbb::global_control::max_allowed_parallelism, 2);
+    dfb::TbbExecutor executor(2);
+    for (int round = 0; round < 5; ++round) {
+        std::atomic<bool> hasRun{false};
+        std::atomic<int> bodies{0};
+        executor.parallelFor(2, [&](std::size_t) {
+            const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(2);
+            const bool isLong = ++bodies == 2; // the other one waits until this has begun, on another thread
+            if (isLong)
+                executor.submit([&] { hasRun = true; });
+            while (!(isLong ? hasRun.load() : bodies == 2) && std::chrono::steady_clock::now() < limit)
+                std::this_thread::yield();
+        });
+        CHECK(hasRun);
+    }
+}
+#endif
 
 } // namespace exec_cases
