@@ -240,14 +240,14 @@ public:
         return counts; // they are the same before and after the check for tasks
     }
 
-    // Takes a message about credit of the current epoch. Returns false if the message is of another kind. Throws Error
-    // (MalformedMessage).
+    // Takes a message about credit of the current epoch, which its sender may wait to have answered. Returns false if
+    // the message is of another kind. Throws Error (MalformedMessage).
     bool receiveCredit(int source, const MessageHeader& header, const Buffer& message)
     {
         if (header.kind == MessageKind::CreditRequest)
-            flow_.requested(source, bodyOf<FlowControl::Request>(message));
+            makePart([&] { flow_.requested(source, bodyOf<FlowControl::Request>(message)); });
         else if (header.kind == MessageKind::Credit)
-            flow_.credited(source, bodyOf<FlowControl::Credit>(message));
+            makePart([&] { flow_.credited(source, bodyOf<FlowControl::Credit>(message)); });
         else
             return false;
         return true;
@@ -756,9 +756,9 @@ private:
                 handler_.incoming(a.source, a.header, std::move(a.message));
             }
         } catch (const Error& e) {
-            giveUp(a.source, e.info()); // some rank waits for it
+            orGiveUp([&] { giveUp(a.source, e.info()); }); // some rank waits for it
         } catch (const std::bad_alloc& e) {
-            giveUp(a.source, errorInfo(ErrorKind::Transport, e.what()));
+            orGiveUp([&] { giveUp(a.source, errorInfo(ErrorKind::Transport, e.what())); });
         }
     }
 

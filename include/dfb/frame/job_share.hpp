@@ -10,7 +10,9 @@
 #include <algorithm>
 #include <chrono>
 #include <cstdint>
+#include <exception>
 #include <mutex>
+#include <new>
 #include <optional>
 #include <utility>
 
@@ -158,9 +160,8 @@ public:
         if (header.kind == MessageKind::JobRequest) {
             if (mailbox_.rank() != server_)
                 failMalformed("a request for jobs to a rank that hands out none", server_, mailbox_.rank());
-            mailbox_.sendBody(source, MessageKind::Jobs, frame_.number(),
-                              share_.give(bodyOf<JobRequest>(message), source, mailbox_.size()));
-            return;
+            const JobRange jobs = share_.give(bodyOf<JobRequest>(message), source, mailbox_.size());
+            return send(source, MessageKind::Jobs, jobs);
         }
         if (header.kind != MessageKind::Jobs || source != server_)
             failMalformed("jobs from a rank that hands out none", server_, source);
@@ -168,6 +169,17 @@ public:
     }
 
 private:
+    // Others wait for the message. So if it cannot be sent, the frame fails, even if it may be partial.
+    template <class Body>
+    void send(int to, MessageKind kind, const Body& body)
+    {
+        try {
+            mailbox_.sendBody(to, kind, frame_.number(), body);
+        } catch (const std::bad_alloc&) {
+            mailbox_.orGiveUp([&] { outcome_.failWhole(errorInfoOf(std::current_exception(), {})); });
+        }
+    }
+
     void receiveMine(const JobRange& jobs)
     {
         share_.receive(jobs);
@@ -184,7 +196,7 @@ private:
             if (mailbox_.rank() == server_)
                 outcome_.guarded([&] { receiveMine(share_.give(request, server_, mailbox_.size())); });
             else
-                mailbox_.sendBody(server_, MessageKind::JobRequest, frame_.number(), request);
+                send(server_, MessageKind::JobRequest, request);
         }
         return job;
     }
