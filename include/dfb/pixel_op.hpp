@@ -2,7 +2,8 @@
 // output format (section 3.1.2 of the paper).
 //
 // A PixelOp is a copyable type. Each rank keeps one copy for each frame in flight, and calls process() for several
-// tiles at once, on any thread. An exception makes the frame fail on all ranks; the error has its text.
+// tiles at once, on any thread. With frames in flight a tile of one frame may be processed after the same tile of the
+// next. An exception makes the frame fail on all ranks; the error has its text.
 //
 //   void process(PixelTile&) const;              changes the pixels, sends them elsewhere, ...
 //

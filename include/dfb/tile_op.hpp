@@ -13,7 +13,8 @@
 //   static constexpr ChannelMask channels;       the channels its inputs have (Tile<channels, tileSize>)
 //   void newFrame(const TileInfo&);              forget the last frame; or, with a FrameData,
 //   void newFrame(const TileInfo&, const FrameData&);
-//   void add(Fragment&&);                        keep one input; quick; inputs come in any order
+//   void add(Fragment&&);                        keep one input; quick, and no loops on the executor: other threads
+//                                                wait meanwhile. Inputs come in any order
 //   void finish(FinishedTile&);                  all inputs have come: write every row; called
 //                                                once, in a task; may take long
 //

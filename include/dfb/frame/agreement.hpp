@@ -219,10 +219,13 @@ inline void checkConfig(const FrameBufferConfig& c, const OperationTraits& opera
     if (c.framesInFlight < 1 || (c.framesInFlight > 1 && operations.keepsState))
         failArgument("there cannot be %d frames in flight: 1 or more, and only 1 if the tile operation keeps state",
                      c.framesInFlight);
-    if (c.image.aux & ~(operations.channels & imageAuxChannels))
-        failArgument("the image is to have auxiliary channels (mask %d) that the inputs of this tile operation do not "
-                     "have",
-                     c.image.aux);
+    for (std::size_t channel = 0; channel < channelCount; ++channel)
+        if (hasChannel(c.image.aux & ~(operations.channels & imageAuxChannels), channel))
+            failArgument(hasChannel(imageAuxChannels, channel)
+                             ? "ImageConfig::aux has %s, which the inputs of this tile operation do not have: see its "
+                               "template arguments"
+                             : "ImageConfig::aux has %s, which is no auxiliary channel of an image",
+                         channelNames[channel]);
     constexpr long long longest = longestTimeout.count();
     if (const long long ms = peerTimeout.count(); ms != 0 && (ms < 100 || ms > longest))
         failArgument("a time-out for peers of %lld ms: 0, or 100 to %lld", ms, longest);

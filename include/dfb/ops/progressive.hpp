@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <limits>
 #include <optional>
+#include <type_traits>
 #include <vector>
 
 DFB_NAMESPACE_BEGIN
@@ -57,6 +58,8 @@ public:
     static constexpr ChannelMask neededChannels = detail::needed_channels_v<Base>;
     static constexpr bool activeByDepth = detail::active_by_depth_v<Base>;
     static constexpr bool keepsState = true;
+    static_assert(std::is_base_of_v<detail::FragmentStore, Base>,
+                  "dfb: Progressive works with AlphaBlend, OrderedBlend, DepthComposite and ImageParallel");
 
     void newFrame(const TileInfo& info)
     {
