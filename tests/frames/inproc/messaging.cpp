@@ -1162,6 +1162,100 @@ TEST_CASE("A thread that waits for room gives up only if nothing moves", "[messa
     CHECK_FALSE(o.slow);
 }
 
+namespace {
+
+// A codec that gains nothing, and whose third call takes long: until `mayEnd`.
+class SlowCodec final : public dfb::Codec {
+public:
+    std::uint8_t id() const noexcept override { return 200; }
+    std::size_t bound(std::size_t byteCount) const override { return byteCount; }
+    std::size_t compress(const std::byte*, std::size_t byteCount, std::byte*) const override
+    {
+        if (++calls_ == 3) {
+            hasBegun.set_value();
+            mayEnd.get_future().wait();
+            // For the thread that is in end() to leave it, if it could.
+            std::this_thread::sleep_for(std::chrono::milliseconds(50));
+        }
+        return byteCount;
+    }
+    bool decompress(const std::byte*, std::size_t, std::byte*, std::size_t) const override { return false; }
+
+    mutable std::promise<void> hasBegun, mayEnd;
+
+private:
+    mutable std::atomic<int> calls_{0};
+};
+
+} // namespace
+
+TEST_CASE("A rank that is about to send its last tiles of a partial frame stays in the frame", "[messaging]")
+{
+    // Rank 0 has finished nine tiles of 64 KiB; the last may not be in a message yet. Two messages with three tiles
+    // each have left. There is no credit for the third, which is compressed when the frame has failed and all ranks
+    // have voted.
+    constexpr int tiles = 9;
+    static std::atomic<int> finished{0};
+    finished = 0;
+    struct Count {
+        void process(dfb::PixelTile&) const { ++finished; }
+    };
+    using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, Count, BoardTransport>;
+    const auto codec = std::make_shared<SlowCodec>();
+    std::promise<void> hasVerdict, hasSent;
+    std::atomic<bool> isDecided{false};
+    const auto board = std::make_shared<Board>();
+    board->passed = [&](int from, int, const MessageHeader& header) {
+        if (from == 0 && header.kind == MessageKind::ReduceDown && header.number == 1 && !isDecided.exchange(true))
+            hasVerdict.set_value(); // the frame's first reduction
+        if (from == 0 && header.kind == MessageKind::TilesDone)
+            hasSent.set_value();
+    };
+    std::vector<dfb::FrameReport> reports(2);
+    runOn(board, 2, [&](const auto& communicator) {
+        auto config = configOf(scene::makeScene(0, 1, 64 * (tiles + 1), 64));
+        config.image.format = dfb::OutputFormat::RGBA32F;
+        config.image.displayRank = 1;
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+        config.messages.poolBytes = 0;
+        config.messages.codec = codec;
+        config.messages.compression = dfb::CompressionMode::Always;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(2);
+        Fb fb(communicator, config);
+        dfb::FrameConfig params;
+        params.allowPartial = true;
+        params.timeout = std::chrono::milliseconds(3000);
+        std::promise<void> mayReceive;
+        const auto mayReceiveNow = mayReceive.get_future().share();
+        for (int worker = 0; fb.rank() == 1 && worker < 2; ++worker)
+            fb.executor().submit([=] { mayReceiveNow.wait(); });
+        auto frame = fb.begin(params);
+        if (fb.rank() == 0) {
+            auto tile = std::make_unique<Fb::Tile>();
+            for (int i = 0; i < tiles; ++i) {
+                frame.start(*tile, i);
+                for (std::size_t k = 0; k < 64 * 64; ++k) { // not constant, so that all of it is sent
+                    tile->color[4 * k] = static_cast<float>(k % 777) / 1000;
+                    tile->color[4 * k + 1] = tile->color[4 * k + 3] = 1;
+                }
+                frame.setTile(*tile);
+            }
+            codec->hasBegun.get_future().wait();
+        } else {
+            while (finished < tiles)
+                std::this_thread::yield();
+            frame.cancel();
+            hasVerdict.get_future().wait();
+            codec->mayEnd.set_value();
+            hasSent.get_future().wait();
+            mayReceive.set_value();
+        }
+        reports[static_cast<std::size_t>(fb.rank())] = frame.end();
+    });
+    for (const dfb::FrameReport& report : reports)
+        CHECK(report.tilesIncomplete <= 2); // the one that was never set, and perhaps the last
+}
+
 TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[messaging]")
 {
     // 64 tiles of 64 KiB, and a pool of four. The frame is cancelled when the tiles are finished. `senders`: number of
