@@ -240,8 +240,9 @@ public:
     // The pixel's premultiplied linear RGBA: 4 values to be set.
     double* pixel(std::size_t index) noexcept { return &color_[4 * index]; }
 
-    // Writes all rows of the finished tile. Call it in TileOp::finish(). An image with depth gets +infinity.
-    void finish(FinishedTile& out) const
+    // Writes all rows of the finished tile. Call it in TileOp::finish(). `depth` and `aux` have the other channels of
+    // all its pixels, row by row; null: the channel is empty, and depth +infinity.
+    void finish(FinishedTile& out, const float* depth = nullptr, const AuxRow& aux = {}) const
     {
         std::vector<double> row(4 * static_cast<std::size_t>(width_));
         const double share = 1.0 / static_cast<double>(passes_);
@@ -254,7 +255,12 @@ public:
             }
             for (double& value : row)
                 value *= share;
-            out.setRow(y, row.data(), nullptr);
+            const auto rowOf = [first = static_cast<std::size_t>(y * width_)](auto* all, std::size_t values) {
+                return all ? all + values * first : nullptr;
+            };
+            out.setRow(y, row.data(), rowOf(depth, 1),
+                       {rowOf(aux.normal, 3), rowOf(aux.albedo, 3), rowOf(aux.position, 3), rowOf(aux.primitiveId, 1),
+                        rowOf(aux.instanceId, 1)});
         }
     }
 

@@ -2,6 +2,7 @@
 #include "Brightest.hpp"
 #include "Gamma.hpp"
 #include "SortAndBlend.hpp"
+#include "Strongest.hpp"
 #include "context.hpp"
 
 namespace {
@@ -20,12 +21,14 @@ void check(bool isRight, const char* what, const std::string& text = "")
 
 int main()
 {
-    static_assert(dfb::is_tile_op_v<doc::SortAndBlend> && dfb::is_tile_op_v<doc::Brightest>);
+    static_assert(dfb::is_tile_op_v<doc::SortAndBlend> && dfb::is_tile_op_v<doc::Brightest> && dfb::is_tile_op_v<doc::Strongest>);
     static_assert(dfb::is_pixel_op_v<doc::Gamma>);
     const std::string blending = dfb::testing::checkTileOp<doc::SortAndBlend>();
     check(blending.empty(), "SortAndBlend:", blending);
     const std::string brightest = dfb::testing::checkTileOp<doc::Brightest>();
     check(brightest.empty(), "Brightest:", brightest);
+    const std::string strongest = dfb::testing::checkTileOp<doc::Strongest>();
+    check(strongest.empty(), "Strongest:", strongest);
 
     // "gives the same image": of random layers, some with equal depths, with a background.
     for (std::uint64_t seed = 1; seed <= 4; ++seed) {

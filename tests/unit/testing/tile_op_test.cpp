@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cstddef>
+#include <cstdint>
 #include <limits>
 #include <memory>
 #include <set>
@@ -108,6 +109,47 @@ private:
     std::vector<float> nearest_;
 };
 
+// The strongest input of a pixel, whose id is right or that of the input that came last.
+template <bool isRight>
+struct WithId {
+    static constexpr int tileSize = 16;
+    static constexpr dfb::ChannelMask channels = dfb::allChannels;
+
+    void newFrame(const dfb::TileInfo& info)
+    {
+        images_.newFrame(info);
+        depths_.assign(images_.count(), std::numeric_limits<float>::infinity());
+        normals_.assign(3 * images_.count(), 0.0f);
+        ids_.assign(images_.count(), dfb::noId);
+    }
+    void add(dfb::Fragment&& fragment)
+    {
+        fragment.forEachPixel([&](int x, int y, const float* rgba, float depth, const dfb::FragmentRow& row, int k) {
+            const std::size_t i = images_.index(fragment.header().pass, x, y);
+            const bool isStronger = static_cast<double>(rgba[3]) > images_.pixel(i)[3];
+            if (isStronger || !isRight)
+                ids_[i] = row.instanceId()[k];
+            if (!isStronger)
+                return;
+            std::copy_n(rgba, 4, images_.pixel(i));
+            std::copy_n(row.normal() + 3 * k, 3, normals_.begin() + static_cast<std::ptrdiff_t>(3 * i));
+            depths_[i] = depth;
+        });
+    }
+    void finish(dfb::FinishedTile& out)
+    {
+        dfb::AuxRow aux;
+        aux.normal = normals_.data();
+        aux.instanceId = ids_.data();
+        images_.finish(out, depths_.data(), aux);
+    }
+
+private:
+    dfb::PassImages images_;
+    std::vector<float> depths_, normals_;
+    std::vector<std::uint32_t> ids_;
+};
+
 struct WithFrameData : Strongest<Fault::None> {
     struct FrameData {};
     void newFrame(const dfb::TileInfo& info, const FrameData&) { Strongest::newFrame(info); }
@@ -125,6 +167,8 @@ TEST_CASE("checkTileOp() finds nothing wrong with good operations", "[tile_op_te
 {
     CHECK(checkTileOp<Strongest<Fault::None>>() == "");
     CHECK(checkTileOp<WithFrameData>() == "");
+    CHECK(checkTileOp<WithId<true>>() == "");
+    CHECK(checkTileOp<dfb::BasicAlphaBlend<16, dfb::allChannels>>() == "");
     CHECK(checkTileOp<dfb::AlphaBlend>() == "");
     CHECK(checkTileOp<dfb::DepthComposite>() == "");
     const auto inOrder = [](dfb::TileHeader& header, int layer) {
@@ -141,6 +185,7 @@ TEST_CASE("checkTileOp() finds what a bad operation does wrong", "[tile_op_test]
     CHECK(finds<Fault::OtherMean>("not the mean"));
     CHECK(finds<Fault::NoBackground>("the background does not show"));
     CHECK(checkTileOp<EqualDepthsAsTheyCame>(2).find("order in which inputs come") != std::string::npos);
+    CHECK(checkTileOp<WithId<false>>().find("order in which inputs come") != std::string::npos);
     CHECK(checkTileOp<MissesRow>().find("Not each pixel") != std::string::npos);
 }
 

@@ -29,9 +29,9 @@ template <class Op>
 inline constexpr int tileSizeOf = dfb::detail::tile_size_v<Op>;
 
 // One tile of an image, and the inputs that it gets.
-template <int Size>
+template <int Size, ChannelMask Channels = colorChannel | depthChannel>
 struct TileInputs {
-    using Tile = dfb::Tile<colorChannel | depthChannel, Size>;
+    using Tile = dfb::Tile<Channels, Size>;
 
     TileLayout layout{Size, Size, Size};
     int tile = 0;
@@ -71,14 +71,15 @@ struct TileWire {
 // A finished tile.
 struct TileOutput {
     std::vector<std::byte> color;
-    std::vector<float> depth; // empty if the image has none
+    std::vector<float> depth;   // empty if the image has none
+    std::vector<std::byte> aux; // the other channels, one after the other; also empty then
     dfb::detail::InputFaults faults;
     TileReport report;
     std::size_t bytes = 0; // of the messages
 
     bool operator==(const TileOutput& o) const
     {
-        return color == o.color && depth.size() == o.depth.size()
+        return color == o.color && aux == o.aux && depth.size() == o.depth.size()
                && (depth.empty() || std::memcmp(depth.data(), o.depth.data(), depth.size() * sizeof(float)) == 0);
     }
     // Value i of the colour; only for OutputFormat::RGBA32F.
@@ -91,9 +92,10 @@ struct TileOutput {
 };
 
 // Runs `op` for a tile in one frame as the framebuffer does, but gives it all inputs, without asking isComplete(). They
-// arrive in this order. Sets `written` to the number of pixels that the operation has set.
-template <class Op>
-TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::vector<std::size_t>& order,
+// arrive in this order. `withDepth`: the image has depth, and those of the other channels that the inputs have and an
+// image can have. Sets `written` to the number of pixels that the operation has set.
+template <class Op, ChannelMask Channels>
+TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>, Channels>& in, const std::vector<std::size_t>& order,
                      OutputFormat format, bool withDepth = true, const TileWire& wire = {}, bool dither = false,
                      std::int64_t* written = nullptr)
 {
@@ -105,11 +107,12 @@ TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::ve
     info.tile = in.tile;
     info.region = region;
     info.passes = in.passes;
-    info.wanted = withDepth ? depthChannel : 0;
+    const auto inImage = static_cast<ChannelMask>(withDepth ? depthChannel | (Channels & imageAuxChannels) : 0);
+    info.wanted = inImage;
     info.background = in.background;
     info.minTransmittance = wire.minTransmittance;
     const d::WireCoder coder(wire.precision, d::active_by_depth_v<Op>);
-    const auto wanted = static_cast<ChannelMask>(d::needed_channels_v<Op> | (withDepth ? depthChannel : 0));
+    const auto wanted = static_cast<ChannelMask>(d::needed_channels_v<Op> | inImage);
     TileOutput out;
     if constexpr (d::has_new_frame_with_data_v<Op>)
         op.newFrame(info, typename Op::FrameData{});
@@ -129,6 +132,14 @@ TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::ve
     d::Planes planes;
     planes.at[d::Color] = out.color.data();
     planes.at[d::Depth] = withDepth ? reinterpret_cast<std::byte*>(out.depth.data()) : nullptr;
+    std::size_t words = 0;
+    for (std::size_t c = d::Normal; c < d::channelCount; ++c)
+        words += d::hasChannel(inImage, c) ? d::channelWords[c] : 0;
+    out.aux.assign(4 * words * width * height, std::byte{0xcd});
+    std::byte* next = out.aux.data();
+    for (std::size_t c = d::Normal; c < d::channelCount; ++c)
+        if (d::hasChannel(inImage, c))
+            planes.at[c] = std::exchange(next, next + 4 * d::channelWords[c] * width * height);
     FinishedTile finished(region, format, planes, width, dither);
     op.finish(finished);
     if constexpr (d::has_report_v<Op>)
@@ -139,9 +150,9 @@ TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::ve
 }
 
 // Runs two such frames with a new operation, and returns the second: operations are used again from frame to frame.
-template <class Op>
-TileOutput runTileOp(const TileInputs<tileSizeOf<Op>>& in, const std::vector<std::size_t>& order, OutputFormat format,
-                     bool withDepth = true, const TileWire& wire = {}, bool dither = false)
+template <class Op, ChannelMask Channels>
+TileOutput runTileOp(const TileInputs<tileSizeOf<Op>, Channels>& in, const std::vector<std::size_t>& order,
+                     OutputFormat format, bool withDepth = true, const TileWire& wire = {}, bool dither = false)
 {
     Op op;
     runTileOp(op, in, order, format, withDepth, wire, dither);
@@ -150,8 +161,8 @@ TileOutput runTileOp(const TileInputs<tileSizeOf<Op>>& in, const std::vector<std
 
 // Returns exact pixels: for each, the mean over the passes of what `rule(samples)` returns. The samples are in the
 // order of in.tiles. Where an input has nothing, its sample has colour 0 and depth +infinity.
-template <int Size, class Rule>
-std::vector<Pixel> referenceOf(const TileInputs<Size>& in, const Rule& rule)
+template <int Size, ChannelMask Channels, class Rule>
+std::vector<Pixel> referenceOf(const TileInputs<Size, Channels>& in, const Rule& rule)
 {
     const Region region = in.region();
     std::vector<Pixel> result;
@@ -172,15 +183,15 @@ std::vector<Pixel> referenceOf(const TileInputs<Size>& in, const Rule& rule)
 }
 
 // The exact pixels of AlphaBlend and ImageParallel.
-template <int Size>
-std::vector<Pixel> referenceOf(const TileInputs<Size>& in)
+template <int Size, ChannelMask Channels>
+std::vector<Pixel> referenceOf(const TileInputs<Size, Channels>& in)
 {
     return referenceOf(in, [&](const std::vector<Sample>& samples) { return composite(samples, in.background); });
 }
 
 // Compares all formats and the depth with exact pixels. A wrong depth counts as 4 wrong bytes.
-template <class Op>
-ErrorReport compare(const TileInputs<tileSizeOf<Op>>& in, const std::vector<Pixel>& expected)
+template <class Op, ChannelMask Channels>
+ErrorReport compare(const TileInputs<tileSizeOf<Op>, Channels>& in, const std::vector<Pixel>& expected)
 {
     const auto order = in.order();
     const TileOutput floats = runTileOp<Op>(in, order, OutputFormat::RGBA32F);
@@ -203,15 +214,13 @@ ErrorReport compare(const TileInputs<tileSizeOf<Op>>& in, const std::vector<Pixe
 // Checks an operation of your own against the contract in tile_op.hpp, in one line: REQUIRE(checkTileOp<MyOp>() == "").
 // Returns a sentence for each fault, or nothing. The image must not depend on the order in which inputs come, nor on
 // the frame before. Each pixel must be set. An image of two passes must be the mean of the images of each. Empty inputs
-// must show the background. Inputs are random, half transparent, and have a depth, but no other channel; in half of
-// the rounds many depths are equal. `label(header,
-// layer)` may set the generation and source that the operation expects; without it they are generation 1 and source
-// `layer`. For operations that keep no state.
+// must show the background. Inputs are random, half transparent, and have a depth and the operation's other channels;
+// in half of the rounds many depths are equal. `label(header, layer)` may set the generation and source that the
+// operation expects; without it they are generation 1 and source `layer`. For operations that keep no state.
 template <class Op, class Label, std::enable_if_t<std::is_invocable_v<const Label&, TileHeader&, int>, int> = 0>
 std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
 {
-    static_assert((Op::channels & ~(colorChannel | depthChannel)) == 0, "its inputs have colour and depth only");
-    using Inputs = TileInputs<tileSizeOf<Op>>;
+    using Inputs = TileInputs<tileSizeOf<Op>, static_cast<ChannelMask>(Op::channels | depthChannel)>;
     constexpr int size = tileSizeOf<Op>, layers = 3;
     std::mt19937_64 random(seed);
     const auto number = [&] { return static_cast<float>(random() >> 40) * 0x1p-24f; };
@@ -236,6 +245,13 @@ std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
                         for (int c = 0; c < 3; ++c)
                             rgba[c] = rgba[3] * number();
                         tile.depth[y * size + x] = 1 + (hasFewDepths ? static_cast<float>(random() % 2) : number());
+                        tile.forEachPlane(tile,
+                                          [&, pixel = static_cast<std::size_t>(y * size + x)](auto c, auto& values) {
+                                              const std::size_t words = dfb::detail::channelWords[c];
+                                              for (std::size_t w = 0; w < words && c > dfb::detail::Depth; ++w)
+                                                  values[words * pixel + w] =
+                                                      static_cast<std::decay_t<decltype(values[0])>>(random() % 4);
+                                          });
                     }
             }
         return in;
