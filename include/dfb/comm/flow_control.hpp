@@ -108,9 +108,9 @@ public:
         Outgoing& out = peerOf(destination).out;
         underWay_ += message.size();
         if (out.queue.empty() && out.sent + message.size() <= out.granted)
-            return transmit(destination, std::move(message), lock);
+            return transmit(destination, out, std::move(message), lock);
         out.queue.push(std::move(message));
-        ask(destination, lock);
+        ask(destination, out, lock);
     }
 
     // Bytes that were given to send() and that, as far as is known, no receiver has taken out of its inbox.
@@ -148,10 +148,10 @@ public:
         if (credit.consumed > out.consumed)
             underWay_ -= credit.consumed - std::exchange(out.consumed, credit.consumed);
         while (!out.queue.empty() && out.sent + out.queue.front().size() <= out.granted) {
-            transmit(from, out.queue.pop(), lock);
+            transmit(from, out, out.queue.pop(), lock);
             lock.lock();
         }
-        ask(from, lock);
+        ask(from, out, lock);
     }
 
     // ---- the receiver's side
@@ -244,9 +244,9 @@ private:
     Peer& peerOf(int rank) { return peers_.try_emplace(rank, allowance_).first->second; }
 
     // Transmits a message, which there is credit for. Releases the lock.
-    void transmit(int destination, Buffer&& message, std::unique_lock<std::mutex>& lock)
+    void transmit(int destination, Outgoing& out, Buffer&& message, std::unique_lock<std::mutex>& lock)
     {
-        peerOf(destination).out.sent += message.size();
+        out.sent += message.size();
         ++transmitting_; // under the lock, so that allSent() always sees the message
         struct End {
             std::atomic<int>& count;
@@ -257,9 +257,8 @@ private:
     }
 
     // Asks for credit if messages wait and no request is out. Releases the lock.
-    void ask(int destination, std::unique_lock<std::mutex>& lock)
+    void ask(int destination, Outgoing& out, std::unique_lock<std::mutex>& lock)
     {
-        Outgoing& out = peerOf(destination).out;
         if (out.queue.empty() || out.asks())
             return;
         const Request request = requestOf(out);
