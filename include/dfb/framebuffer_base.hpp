@@ -24,13 +24,12 @@ DFB_NAMESPACE_BEGIN
 class FrameBufferBase;
 
 // A frame that has begun, without what depends on the type of its tiles: DistributedFrameBuffer::begin() returns a
-// BasicFrame. If it is destroyed without end(), the frame fails on all ranks, except that it may end well after
-// isDone(). The destructor waits until all ranks know the result. Unless a member says otherwise, any thread may call
-// it, it waits for nothing, and the index of a tile is not checked.
+// BasicFrame. If it is destroyed, or another frame assigned to it, without end(), the frame fails on all ranks, except
+// that it may end well after isDone(). Both wait until all ranks know the result. Unless a member says otherwise, any
+// thread may call it, it waits for nothing, and the index of a tile is not checked.
 class FrameBase {
 public:
     FrameBase(FrameBase&&) noexcept = default;
-    FrameBase& operator=(FrameBase&&) = delete;
 
     // The number of the frame, as in FrameReport::frame.
     std::int64_t number() const noexcept { return number_; }
@@ -168,6 +167,7 @@ protected:
         : fb_(&fb), engine_(&engine), number_(engine.frame()), open_(&engine)
     {
     }
+    FrameBase& operator=(FrameBase&&) noexcept = default; // a BasicFrame can be assigned to one of its type
 
     // A tile that each thread keeps for its next job. A job takes it, because the thread may be given another job while
     // a renderer waits inside this one.

@@ -1158,7 +1158,35 @@ TEST_CASE("A frame that has ended or was moved from cannot be ended", "[errors]"
         CHECK_THROWS_AS(frame.isDone(), dfb::InvalidArgument);
         CHECK_THROWS_AS(frame.tryEnd(), dfb::InvalidArgument);
         CHECK_THROWS_AS(frame.end(), dfb::InvalidArgument);
+        frame = fb.begin(params); // as a member of a window would be
+        frame.declare({});
+        CHECK(frame.end().frame == 2);
     });
+}
+
+TEST_CASE("A frame that another one is assigned to is left", "[errors]")
+{
+    std::string text;
+    std::int64_t number = 0;
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        auto config = configOf(scene::makeScene(3));
+        config.framesInFlight = 2;
+        FrameBuffer<Blend> fb(communicator, config);
+        auto frame = fb.begin();
+        auto next = fb.begin();
+        if (fb.rank() == 0) {
+            frame = std::move(next);
+            number = frame.number();
+        } else {
+            try {
+                frame.end();
+            } catch (const dfb::FrameError& e) {
+                text = e.what();
+            }
+        }
+    });
+    CHECK(number == 2);
+    CHECK(text.find("the frame was left without end()") != std::string::npos);
 }
 
 TEST_CASE("What was not declared, or not sent as declared, is named", "[errors]")
