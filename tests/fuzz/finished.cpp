@@ -1,10 +1,10 @@
-// FinishedRecord and FinalGather: pixels are written only within the tile that a record names, tiles of other owners
+// FinishedRecord and GatheredImage: pixels are written only within the tile that a record names, tiles of other owners
 // and repeated tiles are refused, and a record that is written again is the same.
 //
 // An input: format, channels and flags; the length of a batch and the batch; the rest is a count of tiles.
 #include "fuzz.hpp"
 
-#include <dfb/gather/final_gather.hpp>
+#include <dfb/gather/gathered_image.hpp>
 #if defined(DFB_HAS_SNAPPY)
 #include <dfb/comm/snappy_codec.hpp>
 #endif
@@ -21,10 +21,6 @@ using d::FinishedRecord;
 constexpr int side = 8, width = 20, height = 13;
 constexpr std::size_t mostBytes = 4096;
 enum Flags : std::uint8_t { HasCodec = 1, MakeHeader = 2, Record = 4, Splits = 8, Shared = 16 };
-
-struct BatchHeader { // as in FinalGather
-    std::uint64_t rawBytes = 0, codec = 0;
-};
 
 std::shared_ptr<const dfb::Codec> codec()
 {
@@ -122,18 +118,17 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     dfb::FrameBufferConfig config;
     config.image.format = format;
     config.messages.codec = flags & HasCodec ? codec() : nullptr;
-    const auto send = [](dfb::Buffer&&, std::size_t) {};
-    d::FinalGather display(pool, layout(), config, channels, 0, 0, 2, ownerOf, send, nullptr);
+    d::GatheredImage display(pool, layout(), config, channels, 0, 2, ownerOf, nullptr);
     if (flags & Shared) // other ranks write tiles into the image
-        display.shareImage([](const std::byte*) { return 0; });
-    display.newFrame(1, false, {});
+        display.share([](const std::byte*) { return 0; });
+    display.newFrame(1);
     auto& image = const_cast<dfb::Image&>(display.image());
     const std::size_t pixelBytes = dfb::bytesPerPixel(format);
     std::memset(image.bytes(), 0xa5, pixelBytes * image.pixelCount());
 
     std::string body = batch;
     if (flags & MakeHeader) {
-        BatchHeader h;
+        d::FinishedBatch h;
         h.rawBytes = batch.size();
         if (config.messages.codec) {
             body.resize(config.messages.codec->bound(batch.size()));
@@ -239,7 +234,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("batch_compressed", 0, MakeHeader | HasCodec, make(0, 1, true, some) + make(0, 5, true, most), 2);
     add("batch_of_another_owner", 0, MakeHeader, make(0, 1, false, most) + make(0, 2, false, most), 2, "", false);
     add("batch_twice_the_same", 0, MakeHeader, make(0, 1, false, most) + make(0, 1, false, most), 2, "", false);
-    BatchHeader h;
+    d::FinishedBatch h;
     h.rawBytes = three.size();
     add("batch_with_header", 0, 0, Output().put(h).text(three).bytes(), 3);
     const std::string placed = Output().put(std::int32_t{1}).put(std::int32_t{3}).bytes();

@@ -523,18 +523,18 @@ std::pair<std::string, std::string> finished(Way way)
         const std::size_t prefix = sizeof(d::MessageHeader);
         bodies.push_back(fuzz::textOf(message.data() + prefix, message.size() - prefix));
     };
-    d::FinalGather gather(pool, layout, config, channels, 0, 1, 2, ownerOf, send, nullptr);
-    gather.newFrame(1, config.messages.codec != nullptr, {});
+    d::TileSender sender(pool, layout, config, channels, 0, send, nullptr);
+    sender.newFrame(1, config.messages.codec != nullptr, true);
     for (const int tile : {1, 3, 5}) {
-        auto place = gather.reserve(tile);
+        auto place = sender.reserve(tile);
         const dfb::Region region = layout.region(tile);
         for (int i = 0; i < region.width() * region.height(); ++i)
             for (const auto c : {d::Color, d::Depth})
                 if (c == d::Color || config.image.depth)
                     std::memset(place.planes.at[c] + 4 * i, i % 5 == 2 ? 9 : 1, 4);
-        gather.commit(tile, std::move(place), region.width() * region.height());
+        sender.commit(tile, std::move(place), region.width() * region.height());
     }
-    gather.flush();
+    sender.flush();
     return {bodies.at(0), bodies.at(1)};
 }
 

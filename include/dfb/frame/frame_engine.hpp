@@ -88,9 +88,9 @@ public:
     int ownerNow(int tile) const noexcept override { return pipeline_->table().owner(tile); }
     const std::vector<int>& ownedNow() const noexcept override { return pipeline_->table().owned(); }
     const std::vector<int>& nodeOf() const noexcept override { return nodeOf_; }
-    const Image& image() const noexcept override { return imageFrame() < 0 ? noImage_ : pipeline_->gather().image(); }
-    std::int64_t imageFrame() const noexcept override { return pipeline_->gather().imageFrame(); }
-    bool isComplete(int tile) const override { return pipeline_->gather().isComplete(tile); }
+    const Image& image() const noexcept override { return imageFrame() < 0 ? noImage_ : gathered()->image(); }
+    std::int64_t imageFrame() const noexcept override { return gathered() ? gathered()->frame() : -1; }
+    bool isComplete(int tile) const override { return gathered() && gathered()->isComplete(tile); }
     bool isOpen() const noexcept override { return open_.state() != FrameState::Closed; }
     std::int64_t frame() const noexcept override { return open_.number(); }
     bool failed() const noexcept override { return outcome_->failed(); }
@@ -107,8 +107,8 @@ public:
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
         const bool haveMoved = pipeline_->table().setOwners(params.owners);
-        if (haveMoved)
-            pipeline_->gather().findSenders();
+        if (haveMoved && gathered())
+            gathered()->findSenders();
         params_ = params;
         if (!start.keeps)
             mergeErrorBound_ = 0;
@@ -297,7 +297,7 @@ public:
         if (params_.declared && !declarations_.declared() && !outcome_->failed())
             outcome_->failWhole(open_.reason().value_or(
                 errorInfo(ErrorKind::InvalidArgument, "end() of a frame with declared inputs without declare()")));
-        if (pipeline_->gather().displays())
+        if (gathered())
             outcome_->guarded([this] { pipeline_->finishBackground(); });
         outcome_->closeInputs();
     }
@@ -415,6 +415,7 @@ public:
 
 private:
     const OperationTraits& traits() const noexcept { return operations_.traits(); }
+    GatheredImage* gathered() const noexcept { return pipeline_->image(); }
 
     using Clock = std::chrono::steady_clock;
 
@@ -508,7 +509,7 @@ private:
     // themselves. A rank that gets this message only after its first frame goes on sending its tiles.
     void tellImagePlace()
     {
-        if (rank() != config_.image.displayRank)
+        if (!gathered())
             return;
         Connection& connection = mailbox_->connection();
         std::optional<ImagePlaces> places;
@@ -516,8 +517,7 @@ private:
             if (!connection.isSeenBy(other))
                 continue;
             if (!places)
-                places =
-                    pipeline_->gather().shareImage([&](const std::byte* block) { return connection.placeOf(block); });
+                places = gathered()->share([&](const std::byte* block) { return connection.placeOf(block); });
             if (!places)
                 return;
             mailbox_->sendBody(other, MessageKind::ImagePlace, open_.next(), *places);
@@ -552,21 +552,24 @@ private:
     {
         if (mailbox_->receiveCredit(source, header, message))
             return outcome_->tryVote(); // the vote may have waited for this credit
-        FinalGather& gather = pipeline_->gather();
         switch (header.kind) {
         case MessageKind::Abort: return outcome_->receiveAbort(header, message);
         case MessageKind::ReduceUp:
         case MessageKind::ReduceDown: return outcome_->receiveReduction(source, header, message);
         case MessageKind::ImagePlace:
-            return gather.receivePlaces(source, bodyOf<ImagePlaces>(message),
-                                        [&](std::int32_t place, std::size_t byteCount) {
-                                            return mailbox_->connection().blockAt(source, place, byteCount);
-                                        });
+            if (!pipeline_->sender())
+                failMalformed("the place of an image for a rank that sends no tiles");
+            return pipeline_->sender()->receivePlaces(
+                source, bodyOf<ImagePlaces>(message), [&](std::int32_t place, std::size_t byteCount) {
+                    return mailbox_->connection().blockAt(source, place, byteCount);
+                });
         case MessageKind::FinishedTiles:
         case MessageKind::TilesDone:
             if (outcome_->failed() && !params_.allowPartial)
                 return;
-            gather.receive(source, header, std::move(message));
+            if (!gathered())
+                failMalformed("a finished tile was sent to a rank that displays nothing");
+            gathered()->receive(source, header, std::move(message));
             return outcome_->tryVote();
         case MessageKind::Fragment:
         case MessageKind::Manifest:
@@ -734,7 +737,7 @@ private:
     // Called when the last of this rank's tiles has been finished.
     void allFinished()
     {
-        pipeline_->gather().flush();
+        pipeline_->flush();
         open_.setTilesFinished();
         outcome_->tryVote();
     }
@@ -775,7 +778,7 @@ private:
     void addFigures(Verdict& v)
     {
         pipeline_->addTo(v);
-        v.sums.bytesSent = mailbox_->bytesSent() + pipeline_->gather().placedBytes();
+        v.sums.bytesSent = mailbox_->bytesSent() + (pipeline_->sender() ? pipeline_->sender()->placedBytes() : 0);
         v.sums.messagesSent = mailbox_->messagesSent();
         v.sums.tilesTouched = pipeline_->table().touchedCount();
         v.sums.lateMessages = open_.takeLateCount();

@@ -123,14 +123,14 @@ public:
     {
         const bool isPartial = terms_.allowPartial;
         const auto matters = [isPartial](const Buffer& message) {
-            return isPartial && FinalGather::isFinishedTile(loadAs<MessageHeader>(message.data()).kind);
+            return isPartial && GatheredImage::takes(loadAs<MessageHeader>(message.data()).kind);
         };
         // If something is missing, it may be credit: then do not wait for credit.
         if (isMissing(why))
             isCreditInDoubt_ = true;
         mailbox_.flow().drop(matters, isPartial && !isMissing(why));
         if (isPartial && !frame_.areTilesFinished())
-            tiles_.gather().flush();
+            tiles_.flush();
     }
 
     // ---- messages
@@ -286,11 +286,12 @@ public:
         });
         mailbox_.connection().expectMessages(false);
         lastFailed_ = failure || verdict.error;
-        tiles_.gather().closeImage();
+        if (tiles_.image())
+            tiles_.image()->close();
         if (!failure && isPartial(verdict))
             tiles_.setIncomplete(verdict.incomplete);
         else if (lastFailed_)
-            tiles_.gather().invalidate();
+            tiles_.invalidateImage();
         if (failure)
             std::rethrow_exception(failure);
         return verdict;
@@ -333,7 +334,7 @@ private:
     }
 
     // Whether this rank has nothing left to do and only waits for other ranks.
-    bool isDone() const { return frame_.areTilesFinished() && tiles_.table().isSaid() && tiles_.gather().complete(); }
+    bool isDone() const { return frame_.areTilesFinished() && tiles_.table().isSaid() && tiles_.isImageComplete(); }
 
     // A rank with a progress thread may vote before all of its messages have left. There are two exceptions. If only
     // end() moves messages, all must have left: ranks that are out of end() take none. In a frame that may be partial,
@@ -372,10 +373,11 @@ private:
     void waitForFinishedTiles()
     {
         const auto areThere = [this] {
-            return tiles_.gather().complete() && frame_.isIdle() && mailbox_.flow().allSent();
+            return tiles_.isImageComplete() && frame_.isIdle() && mailbox_.flow().allSent();
         };
         if (!hasTimeout()) // a message that could not be read does not come again
-            mailbox_.wait([&] { return areThere() || frame_.isDamaged() || tiles_.gather().hasLost(); });
+            mailbox_.wait(
+                [&] { return areThere() || frame_.isDamaged() || (tiles_.image() && tiles_.image()->hasLost()); });
         mailbox_.wait(areThere, Clock::now() + (hasTimeout() ? terms_.timeout() : std::chrono::seconds(2)));
     }
 
@@ -441,8 +443,8 @@ private:
             info = tiles_.table().missing();
             if (info.message.empty())
                 info.message = "tiles that have all their inputs are still being finished";
-        } else if (!tiles_.gather().complete()) {
-            info = tiles_.gather().missing();
+        } else if (!tiles_.isImageComplete()) {
+            info = tiles_.image()->missing();
         } else {
             info.message = "not all ranks have ended this frame";
             addWaitedFor(info, verdictKey());

@@ -9,7 +9,8 @@
 #include <dfb/frame/operations.hpp>
 #include <dfb/frame/tile_table.hpp>
 #include <dfb/frame/verdict.hpp>
-#include <dfb/gather/final_gather.hpp>
+#include <dfb/gather/gathered_image.hpp>
+#include <dfb/gather/tile_sender.hpp>
 #include <dfb/wire/fragment_message.hpp>
 #include <dfb/wire/wire_losses.hpp>
 
@@ -19,9 +20,11 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <limits>
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -33,14 +36,20 @@ class TilePipeline {
 public:
     // `config` and `operations` must live as long as this. Throws InvalidArgument for an impossible configuration.
     TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, Operations& operations, int rank,
-                 int rankCount, std::uint32_t address, FinalGather::Send sendToDisplay, FinalGather::Fail fail)
+                 int rankCount, std::uint32_t address, TileSender::Send sendToDisplay, GatheredImage::Fail fail)
         : pool_(std::move(pool)), config_(config), address_(address), operations_(operations),
           table_(TileLayout(config.image.width, config.image.height, traits().tileWidth, traits().tileHeight),
-                 config.image.ownerMap ? config.image.ownerMap : latticeOwner, rank, rankCount, operations),
-          gather_(
-              pool_, table_.layout(), config, imageChannels(config), address, rank, rankCount,
-              [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay), std::move(fail))
+                 config.image.ownerMap ? config.image.ownerMap : latticeOwner, rank, rankCount, operations)
     {
+        if (config.image.format == OutputFormat::None)
+            return;
+        if (rank == config.image.displayRank)
+            image_.emplace(
+                pool_, table_.layout(), config, imageChannels(config), address, rankCount,
+                [this](int tile) { return table_.owner(tile); }, std::move(fail));
+        else
+            sender_.emplace(pool_, table_.layout(), config, imageChannels(config), address, std::move(sendToDisplay),
+                            std::move(fail));
     }
 
     // Must be called before the first frame, with the same value on all ranks. `hasFarRanks`: whether there are two
@@ -73,12 +82,24 @@ public:
     {
         const int width = traits.tileWidth, height = traits.tileHeight;
         return std::max(largestFragment(width, height, travelling(traits, config)),
-                        FinalGather::largestMessage(static_cast<std::size_t>(width) * static_cast<std::size_t>(height),
-                                                    config.image.format, imageChannels(config)));
+                        largestBatch(FinishedRecord(config.image.format, imageChannels(config)),
+                                     static_cast<std::size_t>(width) * static_cast<std::size_t>(height)));
     }
 
     TileTable& table() noexcept { return table_; }
-    FinalGather& gather() noexcept { return gather_; }
+    // Null on other ranks than the display rank, and without an image.
+    GatheredImage* image() noexcept { return image_ ? &*image_ : nullptr; }
+    // Null on the display rank, and without an image.
+    TileSender* sender() noexcept { return sender_ ? &*sender_ : nullptr; }
+
+    // Whether this rank waits for no finished tile of other ranks.
+    bool isImageComplete() const { return !image_ || image_->complete(); }
+    // See TileSender.
+    void flush()
+    {
+        if (sender_)
+            sender_->flush();
+    }
 
     // No other member may be running. `params` must live until the next newFrame(). `compresses`: whether finished
     // tiles are compressed.
@@ -101,14 +122,18 @@ public:
         info.accumulationId = params.accumulationId;
         info.minTransmittance = config_.minTransmittance;
         info.wanted = imageChannels(config_);
-        for (std::size_t c = 0; c < background_.size(); ++c)
-            background_[c] = params.background[c] + 0.0f; // -0 becomes 0, as it does where something is blended
-        info.background = background_;
+        for (std::size_t c = 0; c < info.background.size(); ++c)
+            info.background[c] = params.background[c] + 0.0f; // -0 becomes 0, as it does where something is blended
+        imageEpoch_ += std::memcmp(&info.background, &background_, sizeof background_) != 0;
+        background_ = info.background;
         info.order = traits().takesOrder ? params.order.get() : nullptr;
         sent_ = travelling(traits(), config_, traits().keepsState || hasPasses, info.order != nullptr);
         backgroundIsFine_ = true;
         table_.newFrame(info, plan);
-        gather_.newFrame(frame, compresses, background_);
+        if (image_)
+            image_->newFrame(frame);
+        if (sender_)
+            sender_->newFrame(frame, compresses, !table_.owned().empty());
         losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.precision.maxColor, largestBackground(),
                          config_.minTransmittance);
         setLayers(params.maxLayers);
@@ -319,16 +344,28 @@ public:
     void fillBackground()
     {
         const FloatEnvironment floatEnvironment;
-        gather_.fillBackground(background_, [this](int tile) { return table_.samples(tile).count == 0; });
+        if (image_)
+            image_->fillBackground(background_, [this](int tile) { return table_.samples(tile).count == 0; });
     }
 
-    // Called when the frame has ended without these tiles; see FinalGather.
+    // Called when the frame has ended without these tiles; see GatheredImage.
     void setIncomplete(std::vector<std::int32_t>& tiles)
     {
-        gather_.setIncomplete(tiles, [this](int tile, bool isOwnerLost) {
+        if (!image_)
+            return;
+        image_->setIncomplete(tiles, [this](int tile, bool isOwnerLost) {
             const bool hasSamples = table_.samples(tile).count > 0; // without, it keeps its pixels
             return isOwnerLost ? hasSamples || !traits().pixelOpIsPointwise : hasSamples && !backgroundIsFine_;
         });
+    }
+
+    // The frame has failed: no pixel of the image is certain. A rank with other owners than the rest may have written
+    // anywhere.
+    void invalidateImage()
+    {
+        ++imageEpoch_;
+        if (image_)
+            image_->invalidate();
     }
 
     // Adds the counts of this frame's inputs and of this rank's tiles. Adds an error if pixels have changed since
@@ -362,14 +399,15 @@ private:
     {
         const Region region = table_.layout().region(tile);
         BackgroundPixels& background = table_.backgroundPixels(tile);
-        auto place = gather_.reserve(tile);
-        background.newFrame(region.width(), region.height(), place.imageEpoch);
+        auto place = reserve(tile);
+        const bool isInImage = place.planes.at[Color] && place.own.empty();
+        background.newFrame(region.width(), region.height(), isInImage ? imageEpoch_ : 0);
         FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither, &background);
-        if (place.own.empty()) // the place is in the image
+        if (isInImage)
             out.storePastCache();
         table_.finish(tile, out);
         storesAreDone();
-        return gather_.commit(tile, std::move(place), out.writtenPixels());
+        return commit(tile, std::move(place), out.writtenPixels());
     }
 
     // The tile operation writes floats, the pixel operation changes them, then they are converted. Returns false if the
@@ -396,13 +434,29 @@ private:
         };
         pixels.aux = auxOf(planes);
         operations_.process(pixels);
-        auto place = gather_.reserve(tile);
+        auto place = reserve(tile);
         FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither);
         for (int y = 0; y < region.height(); ++y) {
             const Planes row = planes.from(width * static_cast<std::size_t>(y));
             out.setRow(y, floatsOf(row.at[Color]), floatsOf(row.at[Depth]), auxOf(row));
         }
-        return gather_.commit(tile, std::move(place), out.writtenPixels());
+        return commit(tile, std::move(place), out.writtenPixels());
+    }
+
+    // Returns where a finished tile goes: into the image, or into a block that commit() sends. Null without an image.
+    TileSender::Place reserve(int tile)
+    {
+        if (image_)
+            return {image_->placeOf(tile), {}, {}};
+        return sender_ ? sender_->reserve(tile) : TileSender::Place();
+    }
+
+    // See TileSender.
+    bool commit(int tile, TileSender::Place&& place, std::int64_t writtenPixels)
+    {
+        if (image_)
+            image_->commit(tile);
+        return !sender_ || sender_->commit(tile, std::move(place), writtenPixels);
     }
 
     bool readsInPlace() const { return traits().readsInPlace && !traits().keepsState && !isLossy(); }
@@ -437,8 +491,10 @@ private:
     Operations& operations_;
     double budget_ = 0; // of the error of colours, see budgetOf()
     TileTable table_;
-    FinalGather gather_;
-    ChannelMask sent_ = 0; // of the inputs of this frame
+    std::optional<GatheredImage> image_;
+    std::optional<TileSender> sender_;
+    std::int64_t imageEpoch_ = 1; // see BackgroundPixels
+    ChannelMask sent_ = 0;        // of the inputs of this frame
     std::array<float, 4> background_{};
     bool backgroundIsFine_ = true; // see finishBackground()
     WireCoder coder_;

@@ -28,7 +28,13 @@ public:
     // A writer that is inside until this is destroyed. Null: it was not let in.
     using Writer = std::unique_ptr<ImageGate, Leave>;
 
-    // `visit`: a frame of an image; not 0, and equal to that of no other frame or image.
+    // Returns the visit for a frame of the framebuffer with this address: not 0, and another one for each frame and
+    // framebuffer.
+    static std::int64_t visitOf(std::uint32_t address, std::int64_t frame) noexcept
+    {
+        return static_cast<std::int64_t>(std::uint64_t{address} << 32 | static_cast<std::uint32_t>(frame));
+    }
+
     Writer enter(std::int64_t visit) noexcept
     {
         writers_.fetch_add(1);

@@ -3,8 +3,11 @@
 //
 // The header is followed by one pixel, the filler, which fills the places of pixels that do not travel (Dense has
 // none), and by a body as in sparse_planes.hpp: Empty, Sparse or Dense. The size of a record is a multiple of 16 bytes.
+//
+// FinishedBatch: the header of a message with such records. FinishedCount: how many records a rank has sent.
 #pragma once
 
+#include <dfb/comm/message.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile_layout.hpp>
 #include <dfb/wire/sparse_planes.hpp>
@@ -38,6 +41,19 @@ public:
     FinishedRecord(OutputFormat format, ChannelMask channels)
         : PlaneFormat(static_cast<ChannelMask>(channels | colorChannel), bytesPerPixel(format) / 4)
     {
+    }
+
+    // Where a region of an image lies. `width`: that of the image in pixels.
+    FinishedPlanes inImage(const Planes& image, int width, const Region& region) const
+    {
+        FinishedPlanes its;
+        its.stride = static_cast<std::size_t>(width);
+        const std::size_t first =
+            static_cast<std::size_t>(region.y0) * its.stride + static_cast<std::size_t>(region.x0);
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (image.at[c])
+                its.planes.at[c] = image.at[c] + first * pixelBytes(c);
+        return its;
     }
 
     // The largest size of a record with so many pixels.
@@ -239,6 +255,26 @@ private:
             fill(row, x, region.width());
         }
     }
+};
+
+// Follows the MessageHeader of MessageKind::FinishedTiles, before the records.
+struct FinishedBatch {
+    std::uint64_t rawBytes = 0; // of the records, before the codec
+    std::uint64_t codec = 0;    // 0: they are not compressed
+};
+inline constexpr std::size_t batchPrefix = sizeof(MessageHeader) + sizeof(FinishedBatch); // bytes before the records
+inline constexpr std::size_t usualBatchBytes = std::size_t{256} << 10; // of a message, unless a tile needs more
+
+// The most bytes of a message with tiles of so many pixels.
+inline std::size_t largestBatch(const FinishedRecord& record, std::size_t tilePixels)
+{
+    return std::max(usualBatchBytes, batchPrefix + record.mostBytes(tilePixels));
+}
+
+// The content of MessageKind::TilesDone: a rank's counts of the frame. Tiles that it has put into the image itself
+// count too, and their indices follow.
+struct FinishedCount {
+    std::int32_t tiles = 0, batches = 0;
 };
 
 } // namespace detail

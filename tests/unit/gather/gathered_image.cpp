@@ -1,17 +1,17 @@
-// FinalGather: the image is complete only when every rank that owns tiles has said how many it sends. Whole frames are
-// in tests/frames, wrong batches in tests/fuzz/finished.cpp.
+// GatheredImage: the image is complete only when every rank that owns tiles has said how many it sends. Whole frames
+// are in tests/frames, wrong batches in tests/fuzz/finished.cpp.
 #include "catch.hpp"
 
-#include <dfb/gather/final_gather.hpp>
+#include <dfb/gather/gathered_image.hpp>
 
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <utility>
 
-namespace final_gather_cases {
+namespace gathered_image_cases {
 
-using dfb::detail::FinalGather;
+using dfb::detail::GatheredImage;
 using dfb::detail::MessageHeader;
 using dfb::detail::MessageKind;
 
@@ -21,9 +21,8 @@ TEST_CASE("A count of tiles from a rank that owns none does not complete the ima
     const dfb::FrameBufferConfig config;
     const dfb::TileLayout layout(128, 64, 64);
     const auto ownerOf = [](int) { return 1; };
-    const auto send = [](dfb::Buffer&&, std::size_t) {};
-    FinalGather display(pool, layout, config, dfb::ChannelMask{0}, 0, 0, 3, ownerOf, send, nullptr);
-    display.newFrame(1, false, {});
+    GatheredImage display(pool, layout, config, dfb::ChannelMask{0}, 0, 3, ownerOf, nullptr);
+    display.newFrame(1);
     const auto give = [&](int source, std::int32_t tiles, std::int32_t batches) {
         const std::pair body(tiles, batches);
         const auto header = MessageHeader::of(MessageKind::TilesDone, 0, 1);
@@ -40,4 +39,4 @@ TEST_CASE("A count of tiles from a rank that owns none does not complete the ima
     CHECK(display.complete());
 }
 
-} // namespace final_gather_cases
+} // namespace gathered_image_cases
