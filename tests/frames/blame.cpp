@@ -136,6 +136,12 @@ struct BlamedConfig {
             {[](Config& c) { c.image.displayRank = 99; }, "the display rank is 99 of "},
             {[](Config& c) { c.framesInFlight = 0; }, "0 frames in flight"},
             {[](Config& c) { c.minTransmittance = 2; }, "a least transmittance of 2"},
+            {[](Config& c) {
+                 c.precision = dfb::HalfLevel();
+                 c.precision.color = dfb::WireFormat::Float16;
+             },
+             "half a level, and another precision"},
+            {[](Config& c) { c.precision = dfb::WireFormat::Bytes; }, "the format bytes is that of inputs of 8 bits"},
             {[](Config& c) { c.image.aux = dfb::normalChannel; }, "ImageConfig::aux has normal"},
             {[](Config& c) { c.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 99; }; },
              "the owner map gives tile 0 to rank 99 of "},

@@ -519,6 +519,18 @@ struct Failures {
         compositor.end();
         const std::string twice = scene::outcomeOf([&] { compositor.end(); });
         result.expect(twice.find("end() without start()") != std::string::npos, "end() twice: " + twice);
+
+        if (compositor.size() > 1) { // its destructor leaves the picture
+            const std::string left = scene::outcomeOf([&] {
+                dfb::ImageCompositor other(dfb::connect<Transport>(communicator), dfb::ImageBlend::Nearest, config);
+                if (isLast)
+                    other.start(good);
+                else
+                    other.composite(good);
+            });
+            result.expect(isLast ? left == "fine" : scene::has(left, "the frame was left without end()"),
+                          "a compositor that goes while a picture is open: " + left);
+        }
         return result;
     }
 };

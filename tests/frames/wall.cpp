@@ -221,6 +221,8 @@ struct WallSkips {
             for (std::size_t i = 0; fb.rank() == 0 && i < wall.image(0).pixelCount(); ++i)
                 result.expect(wall.image(0).rgba32f()[4 * i] == shade, "a wrong pixel");
         }
+        const std::string none = scene::outcomeOf([&] { wall.image(fb.rank() == 0 ? 1 : 0); });
+        result.expect(scene::has(none, "is not driven by this rank"), "a display of another rank: " + none);
         return result;
     }
 };

@@ -279,6 +279,11 @@ TEST_CASE("A tile or a rank that there is not is refused, and nothing comes of i
             for (const int rank : {-1, 2})
                 texts.push_back(outcomeOf([&] { frame.hide(0, 1, rank); }));
             texts.push_back(outcomeOf([&] { frame.nextJob(-1); }));
+            FrameBuffer<dfb::BasicOrderedBlend<16>>::TileView view;
+            texts.push_back(outcomeOf([&] { frame.start(view, 0, 1); }));
+            frame.start(view, 0);
+            view.pass = 1;
+            texts.push_back(outcomeOf([&] { frame.setTile(view); }));
         }
         frame.forEachTile(-1, [](std::int64_t, auto&) { throw std::runtime_error("a job of less than none"); });
         frame.forEachTile(frame.ownedTiles(), [&](auto& tile) { frame.setTile(tile); });
@@ -286,11 +291,13 @@ TEST_CASE("A tile or a rank that there is not is refused, and nothing comes of i
     });
     CHECK(bounds == std::vector<double>(2, 0));
     INFO(joined(texts));
-    REQUIRE(texts.size() == 5);
+    REQUIRE(texts.size() == 7);
     for (const std::string& text : texts)
         CHECK(has(text, "InvalidArgument"));
     CHECK(has(texts[1], "tile 4 of an image of 4 tiles"));
     CHECK(has(texts[3], "rank 2 of 2"));
+    CHECK(has(texts[5], "pass 1 of a tile of 1"));
+    CHECK(has(texts[6], "the tile has 1 passes"));
 }
 
 TEST_CASE("Ranks that call nextJob() for different numbers of jobs are told so", "[errors]")

@@ -738,6 +738,30 @@ TEST_CASE("What is damaged when a rank has given its part of a reduction counts 
     }
 }
 
+TEST_CASE("A rank that leaves is named also where another waits for it already", "[messaging]")
+{
+    const auto board = std::make_shared<Board>();
+    std::promise<void> waits;
+    board->inspect = [over = waits.get_future().share()](int, int, const MessageHeader& header, dfb::Buffer&) {
+        if (header.kind == MessageKind::Leaving)
+            over.wait_for(std::chrono::seconds(20));
+        return Board::What::Pass;
+    };
+    board->passed = [&](int from, int, const MessageHeader& header) {
+        if (from == 1 && header.kind == MessageKind::ReduceUp && header.number == 1) // rank 1 is in allReduce()
+            waits.set_value();
+    };
+    std::string text;
+    runOn(board, 2, [&](const auto& communicator) { // call 1 is the constructor
+        std::optional<FrameBuffer<Blend>> fb(std::in_place, communicator, configOf(sceneFor(Loop::Declared)));
+        if (fb->rank() == 1)
+            text = outcomeOf([&] { fb->allReduce({1}, dfb::Reduce::Sum); });
+    });
+    INFO(text);
+    CHECK(has(text, "rank 0: it has destroyed its framebuffer, compositor or wall after frame 0"));
+    CHECK(has(text, "rank 1 is in collective call 2"));
+}
+
 TEST_CASE("A reduction that no rank can be at is malformed, and nobody waits for it", "[messaging]")
 {
     // A message of the constructor's reduction, which is number 0, gets the number of another reduction.

@@ -339,6 +339,21 @@ TEST_CASE("A matrix camera's rays meet the points that its matrices project ther
     CHECK(largest < 1e-12f);
 }
 
+TEST_CASE("An orthographic camera's projection may have the other sign throughout", "[cameras]")
+{
+    const Matrix v = lookAlong(eye, view, up), &p = projections[3];
+    Matrix negative = p;
+    for (float& value : negative.at)
+        value = -value;
+    const dfb::MatrixCamera camera(v.at, p.at), other(v.at, negative.at);
+    REQUIRE(camera.isOrthographic());
+    CHECK(other.isOrthographic());
+    for (const double x : {0.5, 60.0, 119.5}) {
+        const dfb::Ray ray = camera.ray(x, 20, 120, 90), same = other.ray(x, 20, 120, 90);
+        CHECK((ray.origin == same.origin && ray.direction == same.direction));
+    }
+}
+
 TEST_CASE("Cameras that are none are refused", "[cameras]")
 {
     using dfb::InvalidArgument;

@@ -1,5 +1,7 @@
 #include "catch.hpp"
 
+#include <dfb/comm/inproc_transport.hpp>
+#include <dfb/distributed_framebuffer.hpp>
 #include <dfb/render/deep_parallel.hpp>
 
 #include <limits>
@@ -25,6 +27,17 @@ TEST_CASE("A deep tile keeps 1 to 65535 segments a pixel")
     front->clear();
     deep.writeLayer(0, *front);
     CHECK(front->depth[0] == 0);
+}
+
+TEST_CASE("A loop of deep tiles refuses a number of segments that a tile cannot keep")
+{
+    dfb::runRanks(1, [](dfb::InprocCommunicator communicator) {
+        using FrameBuffer = dfb::DistributedFrameBuffer<dfb::DeepBlend, dfb::NoPixelOp, dfb::InprocTransport>;
+        FrameBuffer fb(communicator, dfb::FrameBufferConfig(8, 8));
+        const dfb::World world;
+        for (const int segments : {0, 65536})
+            CHECK_THROWS_AS(dfb::DeepParallelLoop<FrameBuffer>(fb, world, segments), dfb::InvalidArgument);
+    });
 }
 
 TEST_CASE("The error bound of a deep tile holds for alpha above 1")

@@ -43,6 +43,10 @@ TEST_CASE("A pixel is active if any of its channels is not 0, whatever the sign"
             }
             CHECK(dfb::detail::activePixelBits(rgba, rgba, pixels) == expected);
             CHECK(dfb::detail::findActivePixels(rgba, pixels) == expected);
+            bool isGood = true;
+            CHECK(dfb::detail::findActivePixelsPlain<false>(rgba, rgba, pixels, nullptr, isGood) == expected);
+            const auto* bytes = reinterpret_cast<const std::byte*>(rgba); // one is active if any bit is set
+            CHECK(dfb::detail::activeByteBits(bytes, pixels) == dfb::detail::findActiveBytes(bytes, pixels));
         }
 }
 
@@ -129,10 +133,14 @@ TEST_CASE("Pixels that are copied as they are looked at are those that are found
                 value = values[random() % kinds];
             const float* rgba = row.data() + random() % 2; // not aligned either
             const bool wasGood = round % 4 != 0;
-            bool isGood = wasGood;
-            CHECK(copyAndFindActivePixels(rgba, rgba, count, out.data(), isGood) == findActivePixels(rgba, count));
-            CHECK(isGood == (copyAndCheckColors(rgba, count, plain.data()) && wasGood));
-            CHECK(std::memcmp(out.data(), plain.data(), sizeof(float) * out.size()) == 0); // and no more
+            const bool isExpected = copyAndCheckColors(rgba, count, plain.data()) && wasGood;
+            for (const auto copyAndFind : {copyAndFindActivePixels, findActivePixelsPlain<true>}) {
+                bool isGood = wasGood;
+                std::fill(out.begin(), out.end(), 7.0f);
+                CHECK(copyAndFind(rgba, rgba, count, out.data(), isGood) == findActivePixels(rgba, count));
+                CHECK(isGood == isExpected);
+                CHECK(std::memcmp(out.data(), plain.data(), sizeof(float) * out.size()) == 0); // and no more
+            }
         }
 }
 
