@@ -18,7 +18,6 @@
 #include <condition_variable>
 #include <cstdint>
 #include <exception>
-#include <functional>
 #include <memory>
 #include <mutex>
 #include <new>
@@ -434,110 +433,11 @@ public:
         return result->bytes;
     }
 
-    // Combines `values` element by element over all ranks. `how`: the operation's name. Collective. Waits and throws as
-    // reduce(), and InvalidArgument on all ranks if they make different calls.
-    template <class Operation>
-    std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, const char* how, Operation operation)
-    {
-        Bytes mine;
-        std::vector<std::int64_t> reduced;
-        makePart([&] {
-            mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
-            for (const std::int64_t value : values)
-                mine.put(value);
-            reduced.resize(values.size());
-        });
-        const auto combine = [operation](ByteReader& a, ByteReader& b, Bytes& out) {
-            while (a.left() > 0) {
-                const auto x = a.get<std::int64_t>(), y = b.get<std::int64_t>();
-                out.put(operation(x, y));
-            }
-        };
-        reduceParts(std::move(mine), combine, [&](ByteReader& in) {
-            for (std::int64_t& value : reduced)
-                value = in.get<std::int64_t>();
-        });
-        return reduced;
-    }
-
-    // Returns the bytes of each rank, indexed by rank; their sizes may differ. Collective. Waits and throws as
-    // allReduce().
-    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call)
-    {
-        Bytes mine; // the call; then, for each rank: its number, the size, the bytes
-        makePart([&] {
-            mine = partOf(call);
-            mine.put(static_cast<std::int32_t>(rank()));
-            mine.put(static_cast<std::uint64_t>(own.size()));
-            mine.append(own.data(), own.data() + own.size());
-        });
-        const auto combine = [](ByteReader& a, ByteReader& b, Bytes& out) {
-            a.copyTo(out);
-            b.copyTo(out);
-        };
-        std::vector<std::vector<std::byte>> result;
-        reduceParts(std::move(mine), combine, [&](ByteReader& in) {
-            for (int from = 0; from < size(); ++from) { // they were combined in this order
-                const auto whose = in.get<std::int32_t>();
-                const auto byteCount = in.get<std::uint64_t>();
-                in.require(whose == from && byteCount <= in.left());
-                result.emplace_back(static_cast<std::size_t>(byteCount));
-                in.getBytes(result.back().data(), result.back().size());
-            }
-        });
-        return result;
-    }
-
     // Calls make(), which makes or sends a part that other ranks wait for. If it lacks memory, the connection fails on
     // all ranks, and this throws std::bad_alloc.
     void makePart(FunctionRef<void()> make) { connection_->giveUpWithoutMemory(make); }
 
 private:
-    // Begins this rank's part of a call, with the rank and the call's name. A combined part has the lowest rank; or -1
-    // and a text, if the ranks have made different calls.
-    Bytes partOf(const std::string& call) const
-    {
-        Bytes out;
-        out.put(static_cast<std::int32_t>(rank()));
-        out.putText(call);
-        return out;
-    }
-
-    // Reduces the ranks' parts of a call. `combine(a, b, out)` combines the bytes after the call's name in two parts;
-    // `read` gets these bytes in the combined part of all ranks. Throws InvalidArgument if the ranks have made
-    // different calls.
-    void reduceParts(Bytes&& mine, std::function<void(ByteReader&, ByteReader&, Bytes&)> combine,
-                     FunctionRef<void(ByteReader&)> read)
-    {
-        const Bytes all = reduce(std::move(mine), [combine = std::move(combine)](const Bytes& a, const Bytes& b) {
-            ByteReader as(a), bs(b);
-            const auto rankA = as.get<std::int32_t>(), rankB = bs.get<std::int32_t>();
-            if (rankA < 0 || rankB < 0)
-                return rankA < 0 ? a : b;
-            const std::string callA = as.getText(), callB = bs.getText();
-            Bytes out;
-            if (callA == callB) {
-                out.put(rankA);
-                out.putText(callA);
-                combine(as, bs, out);
-            } else {
-                out.put(std::int32_t{-1});
-                out.putText(printed("rank %d calls %s, rank %d %s: all ranks must make the same calls", rankA,
-                                    callA.c_str(), rankB, callB.c_str()));
-            }
-            return out;
-        });
-        ByteReader in(all);
-        const auto first = in.get<std::int32_t>();
-        std::string call = in.getText();
-        if (first < 0) {
-            connection_->throwIfFailed(); // after a time-out, ranks make different calls
-            throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, std::move(call)), connection_->throwByAll());
-        }
-        read(in);
-        in.end();
-    }
-
     // A message that could not be read may have been a part of this reduction, if some ranks have not entered it yet,
     // or of the next, if the other ranks are through. The first reduction is the one in the constructor of the
     // mailbox's owner. `damage`: the error of a message that came before this reduction.

@@ -2,6 +2,7 @@
 // declarations and the verdict into frames.
 #pragma once
 
+#include <dfb/comm/collectives.hpp>
 #include <dfb/comm/compression.hpp>
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/frame.hpp>
@@ -382,11 +383,12 @@ public:
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) override
     {
         static const char* const names[] = {"sum", "minimum", "maximum"};
-        return mailbox_->allReduce(values, names[static_cast<std::size_t>(how)], [how](std::int64_t x, std::int64_t y) {
-            if (how == Reduce::Sum)
-                return static_cast<std::int64_t>(static_cast<std::uint64_t>(x) + static_cast<std::uint64_t>(y));
-            return how == Reduce::Min ? std::min(x, y) : std::max(x, y);
-        });
+        return detail::allReduce(
+            *mailbox_, values, names[static_cast<std::size_t>(how)], [how](std::int64_t x, std::int64_t y) {
+                if (how == Reduce::Sum)
+                    return static_cast<std::int64_t>(static_cast<std::uint64_t>(x) + static_cast<std::uint64_t>(y));
+                return how == Reduce::Min ? std::min(x, y) : std::max(x, y);
+            });
     }
 
     Image imageOnAllRanks(Engine& gatherer) override
@@ -410,7 +412,7 @@ public:
 
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call) override
     {
-        return mailbox_->allGather(own, call);
+        return detail::allGather(*mailbox_, own, call);
     }
 
 private:
