@@ -11,6 +11,7 @@
 #include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/pixel_op.hpp>
+#include <dfb/render/brick_owners.hpp>
 #include <dfb/render/cameras.hpp>
 #include <dfb/render/deep_parallel.hpp>
 #include <dfb/render/loops.hpp>
