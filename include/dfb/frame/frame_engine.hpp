@@ -107,9 +107,7 @@ public:
             accumulation_.begin(params, traits(), layout().tileCount(), config_.framesInFlight, lastFailed);
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
-        const bool haveMoved = pipeline_->table().setOwners(params.owners);
-        if (haveMoved && gathered())
-            gathered()->findSenders();
+        const bool haveMoved = pipeline_->setOwners(params.owners);
         params_ = params;
         if (!start.keeps)
             mergeErrorBound_ = 0;
@@ -780,7 +778,7 @@ private:
     void addFigures(Verdict& v)
     {
         pipeline_->addTo(v);
-        v.sums.bytesSent = mailbox_->bytesSent() + (pipeline_->sender() ? pipeline_->sender()->placedBytes() : 0);
+        v.sums.bytesSent += mailbox_->bytesSent();
         v.sums.messagesSent = mailbox_->messagesSent();
         v.sums.tilesTouched = pipeline_->table().touchedCount();
         v.sums.lateMessages = open_.takeLateCount();

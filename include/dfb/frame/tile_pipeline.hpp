@@ -21,6 +21,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <exception>
 #include <limits>
 #include <memory>
 #include <mutex>
@@ -49,7 +50,7 @@ public:
                 [this](int tile) { return table_.owner(tile); }, std::move(fail));
         else
             sender_.emplace(pool_, table_.layout(), config, imageChannels(config), address, std::move(sendToDisplay),
-                            std::move(fail));
+                            [fail = std::move(fail)](const std::exception_ptr& reason) { fail(reason, -1); });
     }
 
     // Must be called before the first frame, with the same value on all ranks. `hasFarRanks`: whether there are two
@@ -101,6 +102,15 @@ public:
             sender_->flush();
     }
 
+    // Takes the owners of the next frame; null: those of the owner map. Returns whether they differ from the last ones.
+    bool setOwners(const TileOwners& owners)
+    {
+        const bool haveMoved = table_.setOwners(owners);
+        if (haveMoved && image_)
+            image_->findSenders();
+        return haveMoved;
+    }
+
     // No other member may be running. `params` must live until the next newFrame(). `compresses`: whether finished
     // tiles are compressed.
     void newFrame(std::int64_t frame, const FrameConfig& params, Accumulation::Start start, bool compresses)
@@ -124,7 +134,8 @@ public:
         info.wanted = imageChannels(config_);
         for (std::size_t c = 0; c < info.background.size(); ++c)
             info.background[c] = params.background[c] + 0.0f; // -0 becomes 0, as it does where something is blended
-        imageEpoch_ += std::memcmp(&info.background, &background_, sizeof background_) != 0;
+        const auto& last = table_.frameInfo().background;
+        imageEpoch_ += std::memcmp(&info.background, &last, sizeof last) != 0;
         background_ = info.background;
         info.order = traits().takesOrder ? params.order.get() : nullptr;
         sent_ = travelling(traits(), config_, traits().keepsState || hasPasses, info.order != nullptr);
@@ -373,6 +384,7 @@ public:
     void addTo(Verdict& verdict)
     {
         const TileInfo& frame = table_.frameInfo();
+        verdict.sums.bytesSent = sender_ ? sender_->placedBytes() : 0;
         verdict.sums.nonFinitePixels = faults_.nonFinite;
         verdict.sums.alphaOutsidePixels = faults_.alphaOutside;
         verdict.sums.tilesEndedEarly = table_.endedEarlyCount();
@@ -493,10 +505,10 @@ private:
     TileTable table_;
     std::optional<GatheredImage> image_;
     std::optional<TileSender> sender_;
-    std::int64_t imageEpoch_ = 1; // see BackgroundPixels
-    ChannelMask sent_ = 0;        // of the inputs of this frame
-    std::array<float, 4> background_{};
-    bool backgroundIsFine_ = true; // see finishBackground()
+    std::int64_t imageEpoch_ = 1;       // see BackgroundPixels
+    ChannelMask sent_ = 0;              // of the inputs of this frame
+    std::array<float, 4> background_{}; // of the frame; after finishBackground() as the pixel operation makes it
+    bool backgroundIsFine_ = true;      // see finishBackground()
     WireCoder coder_;
     std::atomic<WireFormat> wireColor_{WireFormat::Float32};
     WireLosses losses_;

@@ -25,8 +25,8 @@ class TileSender {
 public:
     // Sends a message to the display rank. `raw`: its size before the codec; 0: there was no codec.
     using Send = std::function<void(Buffer&&, std::size_t raw)>;
-    // Takes an exception of the codec. `tile`: -1.
-    using Fail = std::function<void(const std::exception_ptr&, int tile)>;
+    // Takes an exception of the codec.
+    using Fail = std::function<void(const std::exception_ptr&)>;
 
     // Where a finished tile goes.
     struct Place : FinishedPlanes {
@@ -45,11 +45,12 @@ public:
             spareBatches_.push_back(std::make_shared<Batch>());
     }
 
-    // `compresses`: whether the codec, if there is one, is used. `hasTiles`: whether this rank owns any.
+    // `compresses`: whether messages are compressed; then there must be a codec. `hasTiles`: whether this rank owns
+    // any.
     void newFrame(std::int64_t frame, bool compresses, bool hasTiles)
     {
         frame_ = frame;
-        compresses_ = compresses && config_.messages.codec;
+        compresses_ = compresses;
         batch_.reset();
         flushed_ = !hasTiles; // then there is nothing to say
         sent_ = {};
@@ -225,7 +226,7 @@ private:
                 }
             } catch (const OutOfMemory&) { // sent uncompressed: the batch has been counted
             } catch (...) {                // so is this one
-                fail_(std::current_exception(), -1);
+                fail_(std::current_exception());
             }
         }
         storeAll(message.data(), MessageHeader::of(MessageKind::FinishedTiles, address_, frame_), h);
