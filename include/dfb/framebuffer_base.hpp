@@ -46,7 +46,7 @@ public:
     // opaqueHides(tileIndex) is false.
     void hide(int tileIndex, int generation, int rank) const
     {
-        engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Hides});
+        engine_->tell(rank, {tileIndex, generation, detail::HidingWord::Hides});
     }
 
     // Whether opaque inputs of that tile hide the inputs behind them in this frame.
@@ -56,12 +56,12 @@ public:
     // show(). Throws as hide().
     void mayHide(int tileIndex, int generation, int rank) const
     {
-        engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::MayHide});
+        engine_->tell(rank, {tileIndex, generation, detail::HidingWord::MayHide});
     }
     // Tells `rank`, after mayHide(), that its inputs can be seen. Throws as hide().
     void show(int tileIndex, int generation, int rank) const
     {
-        engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Shows});
+        engine_->tell(rank, {tileIndex, generation, detail::HidingWord::Shows});
     }
     // Whether mayHide() has told this rank that inputs of that generation may be hidden, and neither hide() nor show()
     // has followed.

@@ -6,7 +6,6 @@
 #include <dfb/comm/connection.hpp>
 #include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
-#include <dfb/frame/hidden_tiles.hpp>
 #include <dfb/frame/operations.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile.hpp>
@@ -20,6 +19,18 @@
 
 DFB_NAMESPACE_BEGIN
 namespace detail {
+
+// What a rank tells another about one of its inputs and those behind it. See FrameBase::hide().
+struct HidingWord {
+    enum Effect : std::int32_t {
+        Hides,
+        MayHide, // it hid them in the last frame; Hides or Shows follows
+        Shows
+    };
+    std::int32_t tile = 0;
+    std::int32_t generation = 0; // the first generation behind the input
+    Effect effect = Hides;
+};
 
 // The members are those of DistributedFrameBuffer and its Frame; see there.
 class Engine {
@@ -54,7 +65,7 @@ public:
     virtual bool isHidden(int tile, int generation) const = 0;
     virtual bool opaqueHides(int tile) const = 0;
     virtual bool isUndecided(int tile, int generation) const = 0;
-    virtual void tell(int other, const HiddenTiles::Message& word) = 0;
+    virtual void tell(int other, const HidingWord& word) = 0;
     virtual bool waitForWord(FunctionRef<bool()> heard) = 0;
     virtual void declare(const std::vector<TileInput>& inputs) = 0;
     virtual void expectLayers(int layers) = 0;

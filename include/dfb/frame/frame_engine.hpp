@@ -122,7 +122,7 @@ public:
         }
         jobs_->newFrame();
         if (traits().opaqueHides)
-            hidden_.newFrame(layout().tileCount());
+            hiding_->newFrame();
         outcome_->newFrame(FrameTerms::of(params, rank()));
         inputsSent_ = 0;
         renderNs_ = -1;
@@ -169,26 +169,11 @@ public:
     }
 
     // See Frame.
-    bool isHidden(int tile, int generation) const override { return generation >= hidden_.from(tile); }
+    bool isHidden(int tile, int generation) const override { return hiding_->isHidden(tile, generation); }
     bool opaqueHides(int tile) const override { return pipeline_->opaqueHides(tile); }
-    bool isUndecided(int tile, int generation) const override { return hidden_.isUndecided(tile, generation); }
-    void tell(int other, const HiddenTiles::Message& word) override
-    {
-        if (word.tile < 0 || word.tile >= layout().tileCount() || word.generation < 1)
-            failArgument("hide() of generation %d of tile %d", word.generation, word.tile);
-        if (other < 0 || other >= size())
-            failArgument("hide() for rank %d of %d", other, size());
-        if (!pipeline_->opaqueHides(word.tile))
-            failArgument("hide() with a tile operation or a frame to which everything counts");
-        if (other == rank())
-            takeWord(word);
-        else
-            mailbox_->sendBody(other, MessageKind::Hidden, open_.number(), word);
-    }
-    bool waitForWord(FunctionRef<bool()> heard) override
-    {
-        return mailbox_->wait([&] { return outcome_->failed() || heard(); }, Clock::now() + config_.quiet);
-    }
+    bool isUndecided(int tile, int generation) const override { return hiding_->isUndecided(tile, generation); }
+    void tell(int other, const HidingWord& word) override { hiding_->tell(other, word); }
+    bool waitForWord(FunctionRef<bool()> heard) override { return hiding_->wait(heard, config_.quiet); }
 
     void expectLayers(int layers) override { pipeline_->setLayers(layers); }
     TileSamples samples(int tile) const override { return pipeline_->table().samples(tile); }
@@ -598,13 +583,7 @@ private:
         if (kind == MessageKind::Fragment) {
             arrive(std::move(message), source);
         } else if (kind == MessageKind::Hidden) {
-            const auto body = bodyOf<HiddenTiles::Message>(message);
-            if (body.tile < 0 || body.tile >= layout().tileCount() || body.generation < 1
-                || !pipeline_->opaqueHides(body.tile))
-                failMalformed("word of hidden inputs of a tile that has none", layout().tileCount() - 1, body.tile);
-            if (body.word < HiddenTiles::Word::Hides || body.word > HiddenTiles::Word::Shows)
-                failMalformed("word of hidden inputs that there is not", 2, static_cast<std::int64_t>(body.word));
-            takeWord(body);
+            hiding_->receive(message);
         } else if (kind == MessageKind::TileLost) {
             const auto tile = bodyOf<std::int32_t>(message);
             if (!params_.allowPartial || !pipeline_->table().isMine(tile))
@@ -623,12 +602,6 @@ private:
         } else {
             jobs_->receive(source, header, message);
         }
-    }
-
-    void takeWord(const HiddenTiles::Message& word)
-    {
-        hidden_.take(word);
-        mailbox_->notify(); // wakes waitForWord()
     }
 
     // ---- tiles
@@ -813,6 +786,7 @@ private:
             [this](const std::exception_ptr& reason, int tile) { failTile(reason, tile); });
         outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_, declarations_, config_.quiet,
                                                   [this](Verdict& verdict) { addFigures(verdict); });
+        hiding_.emplace(*mailbox_, open_, *outcome_, *pipeline_);
         // The rank after the display rank hands out jobs, as the display rank has enough to do.
         jobs_.emplace(*mailbox_, open_, *outcome_, (config_.image.displayRank + 1) % size());
     }
@@ -825,12 +799,12 @@ private:
     std::vector<int> nodeOf_;
     std::vector<Engine*> together_{this};
     Declarations declarations_;
-    HiddenTiles hidden_;
 
     // The frame.
     OpenFrame open_;
     std::unique_ptr<FrameOutcome> outcome_;
     std::optional<JobExchange> jobs_;
+    std::optional<HidingExchange> hiding_;
     FrameConfig params_;
     Accumulation accumulation_;
     double mergeErrorBound_ = 0; // of this frame and those that it continues

@@ -1,10 +1,16 @@
-// HiddenTiles: which inputs of a tile are hidden by an opaque input in front of them, and which may still be.
+// The inputs of tiles that are hidden by an opaque input in front of them, and those that may still be. HiddenTiles has
+// the words of other ranks about them, HidingExchange the messages.
 #pragma once
 
-#include <dfb/version.hpp>
+#include <dfb/base/function_ref.hpp>
+#include <dfb/comm/mailbox.hpp>
+#include <dfb/frame/engine.hpp>
+#include <dfb/frame/outcome.hpp>
+#include <dfb/frame/tile_pipeline.hpp>
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
@@ -14,22 +20,9 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// One object per rank, with the messages (words) that this rank has received. Any thread may call the members, except
-// newFrame().
+// One per rank, with the words that this rank has received. Any thread may call the members, except newFrame().
 class HiddenTiles {
 public:
-    // The effect of an input on those behind it.
-    enum class Word : std::int32_t {
-        Hides,
-        MayHide, // it hid them in the last frame; Hides or Shows follows
-        Shows
-    };
-    struct Message {
-        std::int32_t tile = 0;
-        std::int32_t generation = 0; // the first generation behind the input
-        Word word = Word::Hides;
-    };
-
     void newFrame(int tileCount)
     {
         if (tiles_.size() != static_cast<std::size_t>(tileCount))
@@ -42,20 +35,20 @@ public:
         any_ = anyUndecided_ = false;
     }
 
-    void take(const Message& message)
+    void take(const HidingWord& word)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         any_ = true;
-        Tile& tile = tiles_[static_cast<std::size_t>(message.tile)];
-        if (message.word == Word::Hides)
-            tile.from = std::min(tile.from.load(), message.generation);
-        if (message.word == Word::MayHide)
+        Tile& tile = tiles_[static_cast<std::size_t>(word.tile)];
+        if (word.effect == HidingWord::Hides)
+            tile.from = std::min(tile.from.load(), word.generation);
+        if (word.effect == HidingWord::MayHide)
             anyUndecided_ = true;
         auto at = std::find_if(tile.undecided.begin(), tile.undecided.end(),
-                               [&](const Undecided& u) { return u.generation == message.generation; });
+                               [&](const Undecided& u) { return u.generation == word.generation; });
         if (at == tile.undecided.end())
-            at = tile.undecided.insert(at, {message.generation, 0});
-        at->count += message.word == Word::MayHide ? 1 : -1; // the words may overtake each other
+            at = tile.undecided.insert(at, {word.generation, 0});
+        at->count += word.effect == HidingWord::MayHide ? 1 : -1; // the words may overtake each other
     }
 
     // The first generation that cannot be seen.
@@ -85,6 +78,72 @@ private:
     std::vector<Tile> tiles_;
     std::atomic<bool> any_{false}, anyUndecided_{false};
     mutable std::mutex mutex_;
+};
+
+// One per rank. Any thread may call the members, except newFrame().
+class HidingExchange {
+public:
+    // All must live as long as this.
+    HidingExchange(Mailbox& mailbox, const OpenFrame& frame, FrameOutcome& outcome, const TilePipeline& tiles)
+        : mailbox_(mailbox), frame_(frame), outcome_(outcome), tiles_(tiles)
+    {
+    }
+
+    void newFrame() { hidden_.newFrame(tileCount()); }
+
+    bool isHidden(int tile, int generation) const { return generation >= hidden_.from(tile); }
+    bool isUndecided(int tile, int generation) const { return hidden_.isUndecided(tile, generation); }
+
+    // Gives another rank word, or this one. Throws InvalidArgument if there is no such input or rank.
+    void tell(int other, const HidingWord& word)
+    {
+        if (!isOfInput(word))
+            failArgument("hide() of generation %d of tile %d", word.generation, word.tile);
+        if (other < 0 || other >= mailbox_.size())
+            failArgument("hide() for rank %d of %d", other, mailbox_.size());
+        if (!tiles_.opaqueHides(word.tile))
+            failArgument("hide() with a tile operation or a frame to which everything counts");
+        if (other == mailbox_.rank())
+            take(word);
+        else
+            mailbox_.sendBody(other, MessageKind::Hidden, frame_.number(), word);
+    }
+
+    // Waits until heard() returns true or the frame has failed, but no longer than `limit`. Returns whether it was so.
+    bool wait(FunctionRef<bool()> heard, std::chrono::milliseconds limit)
+    {
+        return mailbox_.wait([&] { return outcome_.failed() || heard(); }, Mailbox::Clock::now() + limit);
+    }
+
+    // Throws Error (MalformedMessage).
+    void receive(const Buffer& message)
+    {
+        const auto word = bodyOf<HidingWord>(message);
+        if (!isOfInput(word) || !tiles_.opaqueHides(word.tile))
+            failMalformed("word of hidden inputs of a tile that has none", tileCount() - 1, word.tile);
+        if (word.effect < HidingWord::Hides || word.effect > HidingWord::Shows)
+            failMalformed("word of hidden inputs that there is not", HidingWord::Shows, word.effect);
+        take(word);
+    }
+
+private:
+    int tileCount() const { return tiles_.table().layout().tileCount(); }
+    bool isOfInput(const HidingWord& word) const
+    {
+        return word.tile >= 0 && word.tile < tileCount() && word.generation >= 1;
+    }
+
+    void take(const HidingWord& word)
+    {
+        hidden_.take(word);
+        mailbox_.notify(); // wakes wait()
+    }
+
+    Mailbox& mailbox_;
+    const OpenFrame& frame_;
+    FrameOutcome& outcome_;
+    const TilePipeline& tiles_;
+    HiddenTiles hidden_;
 };
 
 } // namespace detail

@@ -88,6 +88,7 @@ public:
     }
 
     TileTable& table() noexcept { return table_; }
+    const TileTable& table() const noexcept { return table_; }
     // Null on other ranks than the display rank, and without an image.
     GatheredImage* image() noexcept { return image_ ? &*image_ : nullptr; }
     // Null on the display rank, and without an image.

@@ -269,7 +269,7 @@ TEST_CASE("A message that says what cannot be fails its frame on every rank, and
         {"hidden inputs where everything counts", MessageKind::Manifest, 2,
          [](dfb::Buffer& m) {
              put(m, offsetof(MessageHeader, kind), MessageKind::Hidden);
-             m.shrink(body + sizeof(dfb::detail::HiddenTiles::Message));
+             m.shrink(body + sizeof(dfb::detail::HidingWord));
          },
          "word of hidden inputs"},
         {"a lost tile in a frame that cannot be partial", MessageKind::Manifest, 2,

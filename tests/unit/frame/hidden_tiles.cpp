@@ -6,7 +6,7 @@
 namespace hidden_tiles_cases {
 
 using dfb::detail::HiddenTiles;
-using Word = HiddenTiles::Word;
+using Word = dfb::detail::HidingWord;
 
 TEST_CASE("The first generation that is hidden counts, until the next frame", "[hidden_tiles]")
 {
