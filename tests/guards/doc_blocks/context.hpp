@@ -37,6 +37,14 @@ struct RenderTile {
     }
 };
 
+struct Gpu {
+    void start(const dfb::PerspectiveCamera&);
+    void waitForRow(int y);
+    int width() const;
+    const float *color(int x, int y) const, *depth(int x, int y) const;
+};
+
+extern Gpu gpu;
 extern MPI_Comm communicator;
 extern dfb::World world;
 extern dfb::PerspectiveCamera camera;
