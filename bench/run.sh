@@ -10,6 +10,7 @@ set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
 frames=41 compositing_frames=11 views=12 skip_size=4096x4096 paper_views=8 paper_sizes=256x256,512x512 quick=
+all_ranks="2 3 4 8 16" moving_sizes=1024x1024,2048x2048 large_sizes=2048x2048,4096x4096
 launcher=
 # The fastest variants of each system, and those that sort by depth
 main_rows="limit|defaults|dfb: float32, to|dfb: float32, all in place|in order, float32, to|in order, float32, all in place|in order, bytes, all in place|in order, unorm8|direct|sequential, radix-k|sequential, tree|sequential, binary swap|reduce, radix-kr"
@@ -17,6 +18,7 @@ while [ $# -gt 0 ]; do
     case $1 in
     --quick)
         frames=5 compositing_frames=3 views=4 skip_size=1024x1024 paper_views=3 paper_sizes=256x256 quick=--quick
+        all_ranks="2 4" moving_sizes=1024x1024 large_sizes=2048x2048
         ;;
     --launcher)
         launcher=${2:?"a launcher is missing: sh bench/run.sh [--quick] [--launcher CMD]"}
@@ -73,18 +75,18 @@ python=python3
     echo "run.sh: no pictures of error against time: they need python3 with matplotlib"
 
 # The measurement at one size tells most; the others show whether it holds in general.
-for ranks in 2 3 4 8 16; do
+for ranks in $all_ranks; do
     on_ranks "$ranks" "$bench"/bench_compositing --scene all --size 1024x1024 \
         --frames "$compositing_frames" --commit "$commit" \
         --json "$results/compositing.json" --table "$results/compositing.md"
 done
 for ranks in 2 4 8; do
     for way in --moving --reader; do
-        on_ranks "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 1024x1024,2048x2048 $way \
+        on_ranks "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size "$moving_sizes" $way \
             --only "$main_rows" --frames "$compositing_frames" --commit "$commit" \
             --json "$results/compositing.json" --table "$results/compositing.md"
     done
-    on_ranks "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 2048x2048,4096x4096 \
+    on_ranks "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size "$large_sizes" \
         --only "$main_rows" \
         --frames 5 --commit "$commit" --json "$results/compositing.json" --table "$results/compositing.md"
 done

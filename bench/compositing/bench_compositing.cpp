@@ -45,7 +45,7 @@ struct Options {
 void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 {
     using dfb::ImageBlend, dfb::WireFormat;
-    const auto own = bench::makeConnection(inputs.comm, false);
+    const auto own = bench::connectBy(inputs.comm, false);
     const auto add = [&](const std::string& config, ImageBlend blend, const bench::DfbSettings& settings) {
         bench::addImages(systems, own, inputs, config, blend, settings);
     };
@@ -64,9 +64,9 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     addOrdered("bytes, all in place", sharedBytes);
     add("float32", ImageBlend::ByDepth, {});
     add("float32, all in place", ImageBlend::ByDepth, shared);
-    const auto withDefaults = dfb::connect<dfb::MpiTransport>(inputs.comm);
+    const auto withDefaults = bench::connectBy(inputs.comm);
     bench::addImages(systems, withDefaults, inputs, bench::defaultConfig, ImageBlend::ByDepth, defaults);
-    bench::addImages(systems, bench::makeConnection(inputs.comm, true), inputs, "in order, float32, threads of its own",
+    bench::addImages(systems, bench::connectBy(inputs.comm, true), inputs, "in order, float32, threads of its own",
                      ImageBlend::InOrder, threads);
     addOrdered("within half a level", {dfb::HalfLevel{}});
     addOrdered("unorm16", {WireFormat::Unorm16});

@@ -25,18 +25,18 @@ struct Options {
 
 void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 {
-    const auto connection = bench::makeConnection(inputs.comm, false);
+    const auto connect = bench::connectBy(inputs.comm, false);
     using bench::DfbSettings, dfb::ImageBlend, dfb::WireFormat;
     const auto add = [&](const std::string& config, const DfbSettings& settings) {
-        bench::addImages(systems, connection, inputs, config, ImageBlend::ByDepth, settings);
+        bench::addImages(systems, connect, inputs, config, ImageBlend::ByDepth, settings);
     };
     const auto addOrdered = [&](const std::string& config, const DfbSettings& settings) {
-        bench::addImages(systems, connection, inputs, "in order, " + config, ImageBlend::InOrder, settings);
+        bench::addImages(systems, connect, inputs, "in order, " + config, ImageBlend::InOrder, settings);
     };
     DfbSettings defaults;
     defaults.hasDefaultThreads = true;
-    bench::addImages(systems, dfb::connect<dfb::MpiTransport>(inputs.comm), inputs, bench::defaultConfig,
-                     ImageBlend::ByDepth, defaults);
+    bench::addImages(systems, bench::connectBy(inputs.comm), inputs, bench::defaultConfig, ImageBlend::ByDepth,
+                     defaults);
     add("float32", {});
     addOrdered("float32", {});
     for (const WireFormat format : {WireFormat::Float16, WireFormat::Unorm16, WireFormat::Unorm8}) {
@@ -64,7 +64,7 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     for (const auto& [side, addTiles] : {std::make_pair("32", &bench::addDfb<dfb::BasicAlphaBlend<32>>),
                                          std::make_pair("64", &bench::addDfb<dfb::BasicAlphaBlend<64>>),
                                          std::make_pair("128", &bench::addDfb<dfb::BasicAlphaBlend<128>>)})
-        addTiles(systems, connection, inputs, std::string("tiles of ") + side + ", float32", {});
+        addTiles(systems, connect, inputs, std::string("tiles of ") + side + ", float32", {});
 }
 
 // A disc with a noisy rim and half of it in noisy light before a background without any. It renders a sample of each

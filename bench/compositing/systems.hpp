@@ -189,12 +189,26 @@ struct DfbImage {
     const std::uint8_t* color8 = nullptr;
 };
 
+// Returns the connection of some systems. The first that starts makes it. It ends with the last of those that run, so
+// that their memory is free for others.
+using Connect = std::function<std::shared_ptr<Connection>()>;
+
+inline Connect connectBy(MPI_Comm comm, const dfb::NetworkConfig& options = {})
+{
+    return [comm, options, current = std::make_shared<std::weak_ptr<Connection>>()] {
+        auto connection = current->lock();
+        if (!connection)
+            *current = connection = dfb::connect<dfb::MpiTransport>(comm, options);
+        return connection;
+    };
+}
+
 // Without `hasThreads` each rank works with one thread, as in the other systems.
-inline std::shared_ptr<Connection> makeConnection(MPI_Comm comm, bool hasThreads)
+inline Connect connectBy(MPI_Comm comm, bool hasThreads)
 {
     dfb::NetworkConfig options;
     options.progress = hasThreads ? dfb::Progress::Thread : dfb::Progress::Caller;
-    return dfb::connect<dfb::MpiTransport>(comm, options);
+    return connectBy(comm, options);
 }
 
 inline dfb::FrameBufferConfig configOf(const Inputs& inputs, const DfbSettings& settings, bool toBytes)
@@ -247,7 +261,7 @@ Compositor compositorOf(const std::shared_ptr<Renderer>& r, const Trace& trace, 
 }
 
 // Adds an ImageCompositor, which is told no more than IceT is. `inputs` must outlive the systems, here and below.
-inline void addImages(std::vector<System>& systems, const std::shared_ptr<Connection>& connection, const Inputs& inputs,
+inline void addImages(std::vector<System>& systems, const Connect& connect, const Inputs& inputs,
                       const std::string& config, dfb::ImageBlend blend, const DfbSettings& settings)
 {
     struct Renderer {
@@ -260,11 +274,11 @@ inline void addImages(std::vector<System>& systems, const std::shared_ptr<Connec
         std::vector<DfbImage> images; // by view
         dfb::FrameReport report;
     };
-    addToBoth(systems, "dfb", config, settings, [connection, blend, settings, &inputs](bool toBytes) {
+    addToBoth(systems, "dfb", config, settings, [connect, blend, settings, &inputs](bool toBytes) {
         dfb::FrameBufferConfig c = configOf(inputs, settings, toBytes);
         const Trace trace(inputs.trace);
         c.trace = trace.sink;
-        const auto r = std::make_shared<Renderer>(connection, blend, c);
+        const auto r = std::make_shared<Renderer>(connect(), blend, c);
         for (const View& view : inputs.views)
             r->images.emplace_back(r->dfb, view.image, settings);
         return compositorOf(r, trace, [blend, &inputs](Renderer& by) {
@@ -287,8 +301,8 @@ inline void addImages(std::vector<System>& systems, const std::shared_ptr<Connec
 
 // Adds a framebuffer, with a renderer of bricks that shows its tiles.
 template <class TileOp>
-void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& connection, const Inputs& inputs,
-            const std::string& config, const DfbSettings& settings)
+void addDfb(std::vector<System>& systems, const Connect& connect, const Inputs& inputs, const std::string& config,
+            const DfbSettings& settings)
 {
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp>;
     struct Renderer {
@@ -306,11 +320,11 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
         std::vector<DfbImage> images; // by view
         dfb::FrameReport report;
     };
-    addToBoth(systems, "dfb", config, settings, [connection, settings, &inputs](bool toBytes) {
+    addToBoth(systems, "dfb", config, settings, [connect, settings, &inputs](bool toBytes) {
         dfb::FrameBufferConfig c = configOf(inputs, settings, toBytes);
         const Trace trace(inputs.trace);
         c.trace = trace.sink;
-        const auto r = std::make_shared<Renderer>(connection, c);
+        const auto r = std::make_shared<Renderer>(connect(), c);
         for (const View& view : inputs.views)
             r->images.emplace_back(r->dfb, view.image, settings);
         return compositorOf(r, trace, [&inputs, isToldOrder = settings.isToldOrder](Renderer& by) {

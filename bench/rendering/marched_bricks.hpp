@@ -132,9 +132,9 @@ class MarchedBricks {
 
 public:
     // Collective. The communicator remains the caller's; `config` has size and executor, and what else dfb should do.
-    // `hasThreads`: see makeConnection().
+    // `hasThreads`: see connectBy().
     MarchedBricks(MPI_Comm comm, dfb::FrameBufferConfig config, int viewCount, bool hasThreads = true)
-        : comm_(comm), connection_(makeConnection(comm, hasThreads)), config_(std::move(config)),
+        : comm_(comm), connection_(connectBy(comm, hasThreads)()), config_(std::move(config)),
           width_(config_.image.width), height_(config_.image.height), rank_(rankIn(comm)), grid_(sizeOf(comm)),
           marcher_(boxOf(rank_)), world_({{static_cast<std::uint32_t>(rank_), boxOf(rank_)}}),
           image_(4 * static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_), 0.0f)
