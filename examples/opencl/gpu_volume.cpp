@@ -43,11 +43,11 @@ kernel void render(float4 lower, float4 upper, float4 eye, float4 forward, float
     const float3 way = normalize((forward + (x0 + x + 0.5f) * right + (y0 + y + 0.5f) * up).xyz);
     const float3 a = (lower.xyz - eye.xyz) / way, b = (upper.xyz - eye.xyz) / way;
     const float3 first = fmin(a, b), last = fmax(a, b);
-    const float enter = fmax(fmax(first.x, first.y), fmax(first.z, 0)), leave = fmin(fmin(last.x, last.y), last.z);
+    const float enter = fmax(fmax(first.x, first.y), fmax(first.z, 0.0f)), leave = fmin(fmin(last.x, last.y), last.z);
     float4 color = 0;
     float depth = INFINITY;
     const float step = 0.06f;
-    for (int i = (int)ceil(enter / step); i * step < leave && color.w < 0.999f; ++i) {
+    for (int i = (int)ceil(enter / step); enter < leave && i * step < leave && color.w < 0.999f; ++i) {
         const float psi = orbital(eye.xyz + i * step * way);
         const float alpha = 1 - exp(-step * 8 * psi * psi);
         const float3 hue = psi > 0 ? (float3)(1, 0.55f, 0.15f) : (float3)(0.2f, 0.55f, 1);
