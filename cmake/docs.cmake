@@ -13,7 +13,8 @@ endif()
 
 # A page for each example that is a single file, or for the main file of its folder
 file(GLOB examples CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/examples/*.cpp ${PROJECT_SOURCE_DIR}/examples/tachyon/*.cpp
-  ${PROJECT_SOURCE_DIR}/examples/opencl/*.cpp ${PROJECT_SOURCE_DIR}/examples/vtk/*.cpp ${PROJECT_SOURCE_DIR}/examples/adapters/c/minimal.c
+  ${PROJECT_SOURCE_DIR}/examples/opencl/*.cpp ${PROJECT_SOURCE_DIR}/examples/vtk/*.cpp
+  ${PROJECT_SOURCE_DIR}/examples/adapters/c/minimal.c
   ${PROJECT_SOURCE_DIR}/examples/adapters/c/heat.f90)
 set(pages "")
 foreach(example IN LISTS examples)

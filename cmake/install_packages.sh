@@ -2,10 +2,10 @@
 # sh cmake/install_packages.sh [clang|bench|tests|browser|aarch64]
 # Installs the packages that this machine lacks for building dfb, its tests and its examples. "clang" adds Clang and its
 # sanitizers; "bench" adds what only the benchmarks need; "tests" adds what the site, the Python package (100 MB), the
-# examples with other renderers, on GPUs and in Fortran, and EXR pictures and plots need; "browser" adds what drives the page of
-# the live view; "aarch64" adds a compiler for that processor and qemu. Uses apt-get on Debian and Ubuntu; elsewhere
-# says what is missing and exits with 1, except for the live view, which is then left out. Quick when nothing is
-# missing.
+# examples with other renderers, on GPUs and in Fortran, and EXR pictures and plots need; "browser" adds what drives the
+# page of the live view; "aarch64" adds a compiler for that processor and qemu. Uses apt-get on Debian and Ubuntu;
+# elsewhere says what is missing and exits with 1, except for the live view, which is then left out. Quick when nothing
+# is missing.
 set -eu
 with=${1:-}
 case $#:$with in

@@ -189,8 +189,8 @@ struct DfbImage {
     const std::uint8_t* color8 = nullptr;
 };
 
-// Returns the connection of some systems. The first that starts makes it. It ends with the last of those that run, so
-// that their memory is free for others.
+// Returns a connection that some systems share. The first system that starts makes it. It ends with the last of them,
+// and gives their memory back.
 using Connect = std::function<std::shared_ptr<Connection>()>;
 
 inline Connect connectBy(MPI_Comm comm, const dfb::NetworkConfig& options = {})

@@ -20,7 +20,7 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// What a rank tells another about one of its inputs and those behind it. See FrameBase::hide().
+// A rank's word to another rank about one of its inputs and the inputs behind that one. See FrameBase::hide().
 struct HidingWord {
     enum Effect : std::int32_t {
         Hides,

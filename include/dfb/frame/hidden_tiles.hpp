@@ -4,7 +4,9 @@
 
 #include <dfb/base/function_ref.hpp>
 #include <dfb/comm/mailbox.hpp>
+#include <dfb/comm/message.hpp>
 #include <dfb/frame/engine.hpp>
+#include <dfb/frame/open_frame.hpp>
 #include <dfb/frame/outcome.hpp>
 #include <dfb/frame/tile_pipeline.hpp>
 
@@ -84,7 +86,7 @@ private:
 class HidingExchange {
 public:
     // All must live as long as this.
-    HidingExchange(Mailbox& mailbox, const OpenFrame& frame, FrameOutcome& outcome, const TilePipeline& tiles)
+    HidingExchange(Mailbox& mailbox, const OpenFrame& frame, const FrameOutcome& outcome, const TilePipeline& tiles)
         : mailbox_(mailbox), frame_(frame), outcome_(outcome), tiles_(tiles)
     {
     }
@@ -94,7 +96,8 @@ public:
     bool isHidden(int tile, int generation) const { return generation >= hidden_.from(tile); }
     bool isUndecided(int tile, int generation) const { return hidden_.isUndecided(tile, generation); }
 
-    // Gives another rank word, or this one. Throws InvalidArgument if there is no such input or rank.
+    // Sends the word to rank `other`, or takes it if that is this rank. Throws InvalidArgument if there is no such
+    // input or rank, or if no input of the tile hides others in this frame.
     void tell(int other, const HidingWord& word)
     {
         if (!isOfInput(word))
@@ -109,7 +112,7 @@ public:
             mailbox_.sendBody(other, MessageKind::Hidden, frame_.number(), word);
     }
 
-    // Waits until heard() returns true or the frame has failed, but no longer than `limit`. Returns whether it was so.
+    // Waits until heard() returns true or the frame has failed. Returns false if neither happens within `limit`.
     bool wait(FunctionRef<bool()> heard, std::chrono::milliseconds limit)
     {
         return mailbox_.wait([&] { return outcome_.failed() || heard(); }, Mailbox::Clock::now() + limit);
@@ -141,7 +144,7 @@ private:
 
     Mailbox& mailbox_;
     const OpenFrame& frame_;
-    FrameOutcome& outcome_;
+    const FrameOutcome& outcome_;
     const TilePipeline& tiles_;
     HiddenTiles hidden_;
 };
