@@ -21,8 +21,8 @@ DFB_NAMESPACE_BEGIN
 // at color + 4 * k and its depth at depth + k. Channels that did not travel are null.
 struct FragmentRow {
     const Span* spans = nullptr;
-    int spanCount = 0;
     const float* color = nullptr;
+    int spanCount = 0; // between two pointers: compilers would read these at once, which is slow just after next()
     const float* depth = nullptr;
     detail::ConstPlanes aux; // all channels but colour and depth
 

@@ -140,6 +140,8 @@ public:
     void fillPixels(int x, int y, int count, const std::byte* stored)
     {
         require(x, y, count);
+        if (count == 0)
+            return;
         if (background_)
             background_->add(x, y, count, [&](int from, int some) { writeBackground(from, y, some, stored); });
         else
@@ -197,7 +199,7 @@ private:
         const std::size_t first = pixelAt(x, y), bytes = bytesPerPixel(format_);
         if (float* out = detail::floatsOf(to_.at[detail::Depth]))
             std::fill_n(out + first, count, std::numeric_limits<float>::infinity());
-        if (std::byte* out = to_.at[detail::Color]; out && count > 0) {
+        if (std::byte* out = to_.at[detail::Color]) {
             out += first * bytes;
             std::memcpy(out, stored, bytes);
             for (std::size_t done = 1, all = static_cast<std::size_t>(count); done < all; done *= 2)

@@ -45,11 +45,14 @@ namespace detail {
 inline bool cpuHasAvx2() noexcept
 {
 #if defined(DFB_HAS_AVX2_CLONES)
-    static const bool has = [] {
+    // Not inline, so that this function is.
+    static const bool has = []() __attribute__((noinline))
+    {
         __builtin_cpu_init();
         unsigned a = 0, b = 0, c = 0, d = 0; // Clang 14 knows no name for F16C
         return __builtin_cpu_supports("avx2") != 0 && __get_cpuid(1, &a, &b, &c, &d) != 0 && (c & bit_F16C) != 0;
-    }();
+    }
+    ();
     return has;
 #else
     return false;

@@ -243,13 +243,13 @@ DFB_AVX2 inline __m256 loadAsFloats(const double* values) noexcept
     return _mm256_set_m128(_mm256_cvtpd_ps(_mm256_loadu_pd(values + 4)), _mm256_cvtpd_ps(_mm256_loadu_pd(values)));
 }
 
-// Converts whole groups of eight pixels, and returns the number of pixels; the rest is for toLevels(). This rounds in
+// toLevels() for eight pixels or more, in groups of eight; the last group may overlap the one before. This rounds in
 // float: the value is off by half an ulp, and so is the product, together by 255 * 2^-25 + 2^-17 < 2^-16. If that could
 // matter because a tie is near, or if a colour is within 2 floats of an sRGB threshold, all eight pixels go through
-// toLevels(). `farthest` is at least that of toLevels(), and is a tie for the same pixels. Otherwise it may be up to
+// toLevels(). The result is at least that of toLevels(), and is a tie for the same pixels. Otherwise it may be up to
 // 2^-15 larger.
 template <bool IsSrgb, class Real>
-DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out, double& farthest) noexcept
+DFB_AVX2 inline double toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out) noexcept
 {
     const float off = 0x1p-16f;
     const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), scale = _mm256_set1_ps(255.0f);
@@ -263,8 +263,9 @@ DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out,
     if constexpr (IsSrgb)
         cells = reinterpret_cast<const int*>(srgbCells().data());
     __m256 all = zero;
-    int i = 0;
-    for (; i + 8 <= count; i += 8) {
+    double farthest = 0;
+    for (int next = 0; next < count; next += 8) {
+        const int i = std::min(next, count - 8);
         __m256i levels[4], nearby = _mm256_setzero_si256();
         __m256 distance = zero;
         for (int part = 0; part < 4; ++part) {
@@ -301,8 +302,7 @@ DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out,
     }
     alignas(32) float most[8];
     _mm256_store_ps(most, all);
-    farthest = std::max(farthest, static_cast<double>(*std::max_element(most, most + 8) + off));
-    return i;
+    return std::max(farthest, static_cast<double>(*std::max_element(most, most + 8) + off));
 }
 #endif
 
@@ -311,13 +311,11 @@ DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out,
 template <bool IsSrgb, class Real>
 double pixelsToLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
 {
-    double farthest = 0;
-    int done = 0;
 #if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2())
-        done = toLevelsAvx2<IsSrgb>(rgba, count, out, farthest);
+    if (count >= 8 && cpuHasAvx2())
+        return toLevelsAvx2<IsSrgb>(rgba, count, out);
 #endif
-    return std::max(farthest, toLevels<IsSrgb>(rgba + 4 * done, count - done, out + 4 * done));
+    return toLevels<IsSrgb>(rgba, count, out);
 }
 
 template <class Real>

@@ -33,14 +33,13 @@ public:
         forEachWord(x, x + count, [&](std::size_t word, std::uint64_t range) { row[word] &= ~range; });
     }
 
-    // Pixels [x, x + count) of row y become the background. Calls write(x, count) for each run of those that are not
-    // background yet.
+    // Pixels [x, x + count) of row y become the background; count > 0. Calls write(x, count) for each run of those
+    // that are not background yet.
     template <class Write>
     void add(int x, int y, int count, const Write& write)
     {
         if (bits_.empty()) {
-            if (count > 0)
-                write(x, count);
+            write(x, count);
             return;
         }
         int begin = 0, end = 0; // a run that may go on in the next word

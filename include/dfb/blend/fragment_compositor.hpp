@@ -329,7 +329,7 @@ private:
                 }
                 if (r.spanCount > 0 && r.spans->x <= x0) {
                     const int offset = x0 - r.spans->x;
-                    layers_.push_back(Layer{r.color, r.depth, nullptr}.from(offset));
+                    layers_.emplace_back() = Layer{r.color, r.depth, nullptr}.from(offset);
                     if (wantsAux) {
                         aux_[layers_.size() - 1] = r.aux.from(static_cast<std::size_t>(offset));
                         layers_.back().aux = &aux_[layers_.size() - 1];
@@ -347,7 +347,7 @@ private:
     void addRun(CompositeRow& row, int x, int count)
     {
         if (!row.wantsSingles && layers_.size() == 1 && count >= wideSingle) {
-            runs_.push_back({x, count, layers_.front().color});
+            runs_.emplace_back() = {x, count, layers_.front().color};
             return;
         }
         switch (rule_) {
@@ -364,7 +364,7 @@ private:
         if (!runs_.empty() && !runs_.back().color && x - (runs_.back().x + runs_.back().count) < narrowGap)
             runs_.back().count = x + count - runs_.back().x;
         else
-            runs_.push_back({x, count, nullptr});
+            runs_.emplace_back() = {x, count, nullptr};
     }
 
     // Finds the places where spans begin or end: between two neighbouring ones the set of layers is constant.

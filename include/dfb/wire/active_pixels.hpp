@@ -139,7 +139,7 @@ struct ActiveSpans {
                 if (spans.size() > before && spans.back().x + spans.back().count == x)
                     spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // goes on across x0
                 else
-                    spans.push_back({static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(run)});
+                    spans.emplace_back() = {static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(run)};
             });
         }
         for (std::size_t i = before; i < spans.size(); ++i) {
@@ -262,7 +262,7 @@ DFB_COMPILED_ONCE void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults
                                        row.color.data() + 4 * (x - valid.x0), areAllClean);
     };
     std::size_t done = 0;
-    row.active.findRow(y, valid.x0, valid.x1, bitsOf, [&](Span span) {
+    row.active.findRow(y, valid.x0, valid.x1, bitsOf, [&](const Span& span) {
         const RowPlace from = at(span.x, y);
         float *toColor = row.color.data() + 4 * done, *toDepth = depth ? row.depth.data() + done : nullptr;
         row.isFull = span.count == valid.width();

@@ -319,7 +319,7 @@ public:
             const auto bitsOf = [&](int x, int count) {
                 return its.activity.bits(its.at(x, y), its.at(x, ahead), count, faults.nonFinite);
             };
-            findRow(y, valid.x0, valid.x1, bitsOf, [&](Span span) {
+            findRow(y, valid.x0, valid.x1, bitsOf, [&](const Span& span) {
                 const std::ptrdiff_t first = y * tile.stride + span.x;
                 bool isClean = true;
                 for (std::size_t i = 0; i < targetCount; ++i) {
