@@ -29,25 +29,29 @@ constexpr float angle = 36; // of view
 using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
 
 // One work item marches along the ray of a pixel, through a brick. All bricks take samples at the same distances from
-// the eye, so the seams between them cannot be seen. A sample on a common face belongs to one brick only.
+// the eye, so the seams between them cannot be seen. `corner` is the way to the upper left corner of the image; `right`
+// and `down` lead from pixel to pixel.
 const char* const source = R"(
 float orbital(float3 p)
 {
     return p.z * (p.x * p.x - p.y * p.y) * exp(-length(p)) * (1 - 0.08f * length(p));
 }
 
-kernel void render(float4 lower, float4 upper, float4 eye, float4 forward, float4 right, float4 up,
+kernel void render(float4 lower, float4 upper, float4 eye, float4 corner, float4 right, float4 down,
                    int x0, int y0, int pitch, global float4* colors, global float* depths)
 {
     const int x = get_global_id(0), y = get_global_id(1), at = y * pitch + x;
-    const float3 way = normalize((forward + (x0 + x + 0.5f) * right + (y0 + y + 0.5f) * up).xyz);
+    const float3 way = normalize((corner + (x0 + x + 0.5f) * right + (y0 + y + 0.5f) * down).xyz);
     const float3 a = (lower.xyz - eye.xyz) / way, b = (upper.xyz - eye.xyz) / way;
     const float3 first = fmin(a, b), last = fmax(a, b);
     const float enter = fmax(fmax(first.x, first.y), fmax(first.z, 0.0f)), leave = fmin(fmin(last.x, last.y), last.z);
     float4 color = 0;
     float depth = INFINITY;
     const float step = 0.06f;
-    for (int i = (int)ceil(enter / step); enter < leave && i * step < leave && color.w < 0.999f; ++i) {
+    const bool hits = enter < leave;
+    for (int i = hits ? (int)(enter / step) : 0; hits && i * step < leave && color.w < 0.999f; ++i) {
+        if (i * step < enter) // a sample on the common face of two bricks belongs to the one behind
+            continue;
         const float psi = orbital(eye.xyz + i * step * way);
         const float alpha = 1 - exp(-step * 8 * psi * psi);
         const float3 hue = psi > 0 ? (float3)(1, 0.55f, 0.15f) : (float3)(0.2f, 0.55f, 1);
@@ -62,9 +66,11 @@ kernel void render(float4 lower, float4 upper, float4 eye, float4 forward, float
 
 cl_float4 toFloat4(const dfb::Vec3& v) { return {{v.x, v.y, v.z, 0}}; }
 
-// A GPU of this node. Ranks take turns to choose one.
-cl::Device deviceFor(int rank)
+// A GPU of this node. Its ranks take turns to choose one.
+cl::Device deviceFor(const FrameBuffer& fb)
 {
+    const auto nodes = fb.nodeOf().begin();
+    const auto before = std::count(nodes, nodes + fb.rank(), nodes[fb.rank()]); // ranks of this node
     std::vector<cl::Platform> platforms;
     try {
         cl::Platform::get(&platforms);
@@ -73,9 +79,12 @@ cl::Device deviceFor(int rank)
     for (const cl_device_type type : {cl_device_type{CL_DEVICE_TYPE_GPU}, cl_device_type{CL_DEVICE_TYPE_ALL}})
         for (const cl::Platform& platform : platforms) {
             std::vector<cl::Device> devices;
-            platform.getDevices(type, &devices);
+            try {
+                platform.getDevices(type, &devices);
+            } catch (const cl::Error&) { // of this driver; others may work
+            }
             if (!devices.empty())
-                return devices[static_cast<std::size_t>(rank) % devices.size()];
+                return devices[static_cast<std::size_t>(before) % devices.size()];
         }
     throw std::runtime_error("OpenCL finds no device; on Debian install pocl-opencl-icd");
 }
@@ -99,13 +108,13 @@ struct Picture {
 class Renderer {
 public:
     Renderer(FrameBuffer& fb, const dfb::World& world)
-        : fb_(fb), world_(world), all_(fb, world), loop_(fb, world, all_), device_(deviceFor(fb.rank())),
-          context_(device_), work_(context_, device_), copies_(context_, device_), program_(context_, source)
+        : fb_(fb), world_(world), loop_(fb, world), device_(deviceFor(fb)), context_(device_), work_(context_, device_),
+          copies_(context_, device_), program_(context_, source)
     {
         program_.build(device_, "-cl-std=CL1.2");
         kernel_ = cl::Kernel(program_, "render");
     }
-    ~Renderer() { clFinish(copies_()); } // after an error it may still copy
+    ~Renderer() { clFinish(copies_()); } // as in start(), without an exception
 
     void render(const dfb::PerspectiveCamera& camera)
     {
@@ -126,13 +135,13 @@ private:
     // Tells the GPU to render all bricks and to copy their pixels. Does not wait for it.
     void start(const dfb::PerspectiveCamera& camera)
     {
+        copies_.finish(); // after a frame that failed it may still copy
         pictures_.clear();
         for (const dfb::Brick& brick : world_.bricks())
             pictures_[brick.id] = pictureOf(camera.project(brick.bounds, width, height).region());
         for (int y = 0; y < height; y += fb_.layout().tileHeight())
             for (const dfb::Brick& brick : world_.bricks())
                 startBand(brick, camera, y);
-        copies_.flush();
     }
 
     // An application with many frames keeps the memory from frame to frame.
@@ -176,14 +185,15 @@ private:
                                    nullptr, &rendered[0]);
         work_.flush();
         const std::size_t first = picture.indexOf(band.x0, y), count = std::size_t(band.width() * band.height());
+        // Some drivers wait here, as OpenCL cannot register memory that it has not allocated. CUDA can.
         copies_.enqueueReadBuffer(picture.colors, CL_FALSE, 16 * first, 16 * count, picture.colorAt(first), &rendered);
         copies_.enqueueReadBuffer(picture.depths, CL_FALSE, 4 * first, 4 * count, picture.depthAt(first), nullptr,
                                   &picture.bands[y]);
+        copies_.flush();
     }
 
     FrameBuffer& fb_;
     const dfb::World& world_;
-    const dfb::SharedWorld all_;
     dfb::DataParallelLoop<FrameBuffer> loop_;
     std::map<std::uint32_t, Picture> pictures_; // by the id of the brick
     cl::Device device_;

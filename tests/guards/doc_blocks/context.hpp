@@ -39,9 +39,10 @@ struct RenderTile {
 
 struct Gpu {
     void start(const dfb::PerspectiveCamera&);
-    void waitForRow(int y);
+    void waitForRow(std::uint32_t id, int y);
     int width() const;
-    const float *color(int x, int y) const, *depth(int x, int y) const;
+    const float *color(std::uint32_t id, int x, int y) const, *depth(std::uint32_t id, int x, int y) const;
+    dfb::Region copiedRegion(std::uint32_t id) const;
 };
 
 extern Gpu gpu;
