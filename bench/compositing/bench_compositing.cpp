@@ -131,7 +131,7 @@ public:
             else
                 sum += (has("direct") ? 20 : has("tree") ? 35 : 60) * used_ * (has("ubyte") ? 0.3 : 1) + 10 * all_;
         }
-        return sum + (hasDfb ? 24 * used_ : 0); // the connection's, of which there is one
+        return sum + (hasDfb ? 24 * used_ : 0); // messages
     }
 
 private:

@@ -22,7 +22,7 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// One per rank, with the words that this rank has received. Any thread may call the members, except newFrame().
+// The words that this rank has received in a frame. Any thread may call the members, except newFrame().
 class HiddenTiles {
 public:
     void newFrame(int tileCount)
@@ -82,7 +82,7 @@ private:
     mutable std::mutex mutex_;
 };
 
-// One per rank. Any thread may call the members, except newFrame().
+// The words of a frame, between ranks. Any thread may call the members, except newFrame() and wait().
 class HidingExchange {
 public:
     // All must live as long as this.
@@ -112,7 +112,8 @@ public:
             mailbox_.sendBody(other, MessageKind::Hidden, frame_.number(), word);
     }
 
-    // Waits until heard() returns true or the frame has failed. Returns false if neither happens within `limit`.
+    // Waits until heard() returns true or the frame has failed. Returns false if neither happens within `limit`. For
+    // threads see FrameBase::waitForWord().
     bool wait(FunctionRef<bool()> heard, std::chrono::milliseconds limit)
     {
         return mailbox_.wait([&] { return outcome_.failed() || heard(); }, Mailbox::Clock::now() + limit);
