@@ -2,15 +2,15 @@
 # sh bench/run.sh [--quick] [--launcher CMD]
 # Installs what is missing, builds the preset "release", gets IceT to compare with, if it is available, and runs all
 # benchmarks except bench_messaging and bench_gather. Tables, figures and pictures go to bench/results. Takes an hour.
-# With --quick it takes 8 minutes, and the files stay in build/bench_results, as they are not precise. With --launcher, bench_compositing also runs on several hosts: CMD, in front of a program,
-# starts it there, ideally as 4 ranks, one on each host. The exit status is 1 if the counts of bench_scaling or
-# bench_skip are wrong.
+# With --quick it takes 8 minutes, and the files stay in build/bench_results, as they are not precise. With --launcher,
+# bench_compositing also runs on several hosts: CMD, in front of a program, starts it there, ideally as 4 ranks, one on
+# each host. The exit status is 1 if the counts of bench_scaling or bench_skip are wrong.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
 frames=41 compositing_frames=11 views=12 skip_size=4096x4096 paper_views=8 paper_sizes=256x256,512x512 quick=
-all_ranks="2 3 4 8 16" moving_sizes=1024x1024,2048x2048 large_sizes=2048x2048,4096x4096
+all_ranks="2 3 4 8 16" some_ranks="2 4 8" moving_sizes=1024x1024,2048x2048 large_sizes=2048x2048,4096x4096
 launcher=
 # The fastest variants of each system, and those that sort by depth
 main_rows="limit|defaults|dfb: float32, to|dfb: float32, all in place|in order, float32, to|in order, float32, all in place|in order, bytes, all in place|in order, unorm8|direct|sequential, radix-k|sequential, tree|sequential, binary swap|reduce, radix-kr"
@@ -18,7 +18,7 @@ while [ $# -gt 0 ]; do
     case $1 in
     --quick)
         frames=5 compositing_frames=3 views=4 skip_size=1024x1024 paper_views=3 paper_sizes=256x256 quick=--quick
-        all_ranks="2 4" moving_sizes=1024x1024 large_sizes=2048x2048
+        all_ranks=4 some_ranks=4 moving_sizes=1024x1024 large_sizes=2048x2048
         ;;
     --launcher)
         launcher=${2:?"a launcher is missing: sh bench/run.sh [--quick] [--launcher CMD]"}
@@ -80,7 +80,7 @@ for ranks in $all_ranks; do
         --frames "$compositing_frames" --commit "$commit" \
         --json "$results/compositing.json" --table "$results/compositing.md"
 done
-for ranks in 2 4 8; do
+for ranks in $some_ranks; do
     for way in --moving --reader; do
         on_ranks "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size "$moving_sizes" $way \
             --only "$main_rows" --frames "$compositing_frames" --commit "$commit" \
@@ -91,7 +91,7 @@ for ranks in 2 4 8; do
         --frames 5 --commit "$commit" --json "$results/compositing.json" --table "$results/compositing.md"
 done
 
-for ranks in 2 4 8; do
+for ranks in $some_ranks; do
     on_ranks "$ranks" "$bench"/bench_overlap --size 256x256,512x512,1024x1024 --views "$views" \
         --commit "$commit" --json "$results/overlap.json" --table "$results/overlap.md"
     on_ranks "$ranks" "$bench"/bench_overlap --size 512x512 --views "$views" --in-a-row 7 \
