@@ -74,7 +74,13 @@ FNR == 1 {
     code = !code
 }
 
-code || /^    / {
+# Indented lines behind an empty one are code, too; in a list, those behind a line of text are not.
+{
+    isCode = code || (/^    / && (isCode || isBehindEmpty))
+    isBehindEmpty = /^$/
+}
+
+isCode {
     print
     next
 }
