@@ -396,7 +396,7 @@ private:
     std::vector<std::uint64_t> marks_;     // a bit for each pixel of a row
     std::vector<int> edges_;               // only the first edgeCount_ are valid
     std::size_t edgeCount_ = 0;
-    std::vector<Run> runs_;
+    std::vector<Run> runs_; // elements are assigned, not pushed: copying values that were just written is slow
     std::vector<Layer> layers_, firsts_;
     std::vector<int> order_;
 };

@@ -138,7 +138,7 @@ struct ActiveSpans {
                 const int x = x0 + at;
                 if (spans.size() > before && spans.back().x + spans.back().count == x)
                     spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // goes on across x0
-                else
+                else // not push_back(): copying values that were just written is slow
                     spans.emplace_back() = {static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(run)};
             });
         }
