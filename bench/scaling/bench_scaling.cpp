@@ -227,9 +227,12 @@ void expectFinished(Expected& e, const Owned& owned, Receivers& to)
 void expectCredit(int rank, const Receivers& to, std::int64_t allowance, std::vector<Expected>& all)
 {
     Expected& e = all[static_cast<std::size_t>(rank)];
+    const auto bytesPerCredit =
+        static_cast<std::int64_t>(dfb::detail::FlowControl::bytesPerCredit(static_cast<std::size_t>(allowance)));
     for (const auto& [other, count] : to) {
         const std::int64_t requests = count.bytes > allowance ? count.messages : 0;
-        const std::int64_t answers = requests + std::min(count.messages, 2 * count.bytes / allowance);
+        // One more than the bytes of this frame make, as some of the last one may have had no answer.
+        const std::int64_t answers = requests + std::min(count.messages, count.bytes / bytesPerCredit + 1);
         e.mostCredits += requests;
         e.mostCreditsIn += answers;
         e.asksForCredit = e.asksForCredit || requests > 0;

@@ -53,6 +53,13 @@ public:
 
     std::size_t poolBytes() const noexcept { return pool_; }
 
+    // After so many consumed bytes the sender gets a Credit unasked. Bytes that it has not been told of must stay below
+    // its part of the pool, as it may wait for them. Also below 4 MiB: a Credit shows that messages are taken.
+    static std::uint64_t bytesPerCredit(std::size_t allowance)
+    {
+        return std::min<std::uint64_t>(allowance / 2, 4 << 20);
+    }
+
     // Forgets everything: all that was sent before has arrived or does not matter any more.
     void newEpoch()
     {
@@ -180,9 +187,7 @@ public:
         in.consumed += byteCount;
         free_ -= extraOf(in, in.granted);
         inboxBytes_ -= byteCount;
-        // Not every message is answered by a Credit. But the bytes that the sender has not been told of must stay below
-        // its part of the pool, as it may wait for them. Also below 4 MiB: a Credit shows that messages are taken.
-        if (in.consumed - in.told >= std::min<std::uint64_t>(allowance_ / 2, 4 << 20))
+        if (in.consumed - in.told >= bytesPerCredit(allowance_))
             grant(source, in, in.consumed + allowance_);
         serve(lock);
     }
