@@ -4,6 +4,7 @@
 #include "catch.hpp"
 #include "random_scene.hpp"
 
+#include <dfb/image_compositor.hpp>
 #include <dfb/testing/fault_transport.hpp>
 #include <dfb/wire/fragment_message.hpp>
 
@@ -1836,6 +1837,32 @@ TEST_CASE("An operation that takes longer than a frame may fails the frame, not 
     CHECK(has(o.texts[0], "FrameError: dfb: timed out"));
     CHECK(has(o.texts[0], "are still being finished"));
     CHECK(o.after == std::vector<std::string>(2, "fine"));
+}
+
+TEST_CASE("A compositor that goes while a picture is open fails it on the other ranks", "[errors]")
+{
+    std::promise<void> started;
+    std::string text;
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        dfb::NetworkConfig network;
+        network.progress = dfb::Progress::Caller; // rank 1 learns of the other image in its destructor, not before
+        dfb::FrameBufferConfig config(64, 64);
+        config.executor = std::make_shared<dfb::CallerExecutor>();
+        dfb::ImageCompositor compositor(dfb::connect<dfb::InprocTransport>(communicator, network),
+                                        dfb::ImageBlend::Nearest, config);
+        const std::vector<std::uint8_t> pixels(4 * 64 * 64, 255);
+        const std::vector<float> depths(64 * 64, 0.5f);
+        const dfb::InputImage image(pixels.data(), depths.data());
+        if (compositor.rank() == 1) {
+            compositor.start(image);
+            started.set_value();
+            return;
+        }
+        started.get_future().wait_for(std::chrono::seconds(20));
+        text = outcomeOf([&] { compositor.composite(image); });
+    });
+    INFO(text);
+    CHECK(has(text, "the frame was left without end()"));
 }
 
 } // namespace errors_cases
