@@ -31,6 +31,21 @@ function endComment(isDocumentation,    i, verbatim, text)
 FNR == 1 && /^\/\// {
     print "/// @file"
     ofFile = 1
+    if (match($0, /^\/\/ [A-Z][A-Za-z]*: /)) # the name of the class that the file is about
+        subject = substr($0, 4, RLENGTH - 5)
+}
+
+# The class that the file is about has the file's comment, if it has no other.
+ofFile && /^\/\// {
+    ofSubject[++subjectCount] = substr($0, 3)
+}
+
+subject != "" && count == 0 && $0 ~ "^(class|struct) " subject "[ {;]" {
+    sub(/^ [A-Z][A-Za-z]*: /, "", ofSubject[1])
+    ofSubject[1] = " " toupper(substr(ofSubject[1], 1, 1)) substr(ofSubject[1], 2)
+    for (count = 1; count <= subjectCount; ++count)
+        comment[count] = ofSubject[count]
+    count = subjectCount
 }
 
 # What Doxygen would link to, although it does not document it: private classes and friends
@@ -73,7 +88,7 @@ hidden {
     column = index($0, "//")
     code = substr($0, 1, column - 1)
     quotes = gsub(/"/, "\"", code)
-    if (column && quotes % 2 == 0 && code ~ /[;,] *$/) {
+    if (column && quotes % 2 == 0 && code ~ /([;,]|^ +[A-Z][A-Za-z0-9]*) *$/) { # the last of an enum has no comma
         behind = column
         print code "///<" plain(substr($0, column + 2))
         next

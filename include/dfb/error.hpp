@@ -40,6 +40,7 @@ inline std::string printed(const char* format, std::va_list values)
 
 } // namespace detail
 
+// See docs/errors.md for the causes and remedies.
 enum class ErrorKind : std::uint32_t {
     InvalidArgument,  // a call with a wrong argument; in a FrameError: a call between begin() and end()
     TooManyInputs,    // a generation has received more inputs than were announced for it
@@ -145,6 +146,7 @@ inline ErrorInfo errorInfo(ErrorKind kind, std::string message, int rank = -1)
 
 } // namespace detail
 
+// The base of all exceptions of the library, except OutOfMemory. what() is info().describe().
 class Error : public std::runtime_error {
 public:
     // The exception keeps `whileThrown` alive.

@@ -89,6 +89,7 @@ struct FrameBufferConfig {
 struct TileSamples {
     int first = 0, count = 1;
 };
+// The samples of all tiles, by number of the tile.
 using SamplePlan = std::shared_ptr<const std::vector<TileSamples>>;
 
 // The parameters of a frame. All ranks must give the same. This is checked by the verdict: the reduction over all ranks

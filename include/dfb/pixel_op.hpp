@@ -61,6 +61,7 @@ constexpr bool checkPixelOp()
 
 } // namespace detail
 
+// Whether T has the members that a pixel operation needs; see the head of this file.
 template <class T>
 inline constexpr bool is_pixel_op_v = std::is_copy_constructible_v<T>&& detail::has_process_v<T>;
 

@@ -336,6 +336,7 @@ constexpr bool checkTileOp()
 
 } // namespace detail
 
+// Whether T has the members that a tile operation needs; see the head of this file.
 template <class T>
 inline constexpr bool is_tile_op_v =
     std::is_default_constructible_v<T>&& detail::has_channels_v<

@@ -17,9 +17,10 @@
 
 DFB_NAMESPACE_BEGIN
 
+// Names a reduction.
 struct ReductionKey {
     std::uint32_t scope = 0; // its purpose
-    std::int64_t number = 0; // which one
+    std::int64_t number = 0; // which of this purpose
     bool operator==(const ReductionKey& o) const { return scope == o.scope && number == o.number; }
 };
 

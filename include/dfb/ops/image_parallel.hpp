@@ -22,6 +22,7 @@ public:
     }
 };
 
+// BasicImageParallel, with tiles of 64 x 64 pixels.
 using ImageParallel = BasicImageParallel<>;
 static_assert(is_tile_op_v<ImageParallel>);
 

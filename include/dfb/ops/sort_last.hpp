@@ -279,8 +279,11 @@ class BasicDepthComposite : public detail::SortLast<BlendRule::Nearest, TileSize
     static_assert((Channels & depthChannel) != 0, "dfb: DepthComposite compares depths");
 };
 
+// BasicAlphaBlend, with tiles of 64 x 64 pixels.
 using AlphaBlend = BasicAlphaBlend<>;
+// BasicOrderedBlend, with tiles of 64 x 64 pixels.
 using OrderedBlend = BasicOrderedBlend<>;
+// BasicDepthComposite, with tiles of 64 x 64 pixels.
 using DepthComposite = BasicDepthComposite<>;
 static_assert(is_tile_op_v<AlphaBlend> && is_tile_op_v<OrderedBlend> && is_tile_op_v<DepthComposite>);
 

@@ -174,6 +174,7 @@ private:
 // overlap.
 template <int TileSize = 64>
 using BasicDeepBlend = BasicAlphaBlend<TileSize, colorChannel | depthChannel | farChannel>;
+// BasicDeepBlend, with tiles of 64 x 64 pixels.
 using DeepBlend = BasicDeepBlend<>;
 
 // Like DataParallelLoop, for bricks that may overlap: the bounds of a brick need only enclose its data. The operation

@@ -27,6 +27,7 @@ inline SamplePlan samplesIn(const TileLayout& layout, const Region& region, int 
     return std::make_shared<const std::vector<TileSamples>>(std::move(plan));
 }
 
+// The parameters of AdaptiveSampler.
 struct SamplingConfig {
     // A tile is done when its TileReport::error, a standard error in units of colour, is at most this. 0: when it
     // has maxSamples.
