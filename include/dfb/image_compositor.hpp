@@ -129,7 +129,8 @@ public:
     void start(const InputImage& image, int place, const FrameConfig& frame = {});
     void start(const InputImage& image, const FrameConfig& frame = {}) { start(image, -1, frame); }
     // In place of start(), on a rank that could not make its image: end() throws a FrameError with the text of `why`
-    // on all ranks, this one among them. The next picture can be made. Waits for nobody. Throws as start().
+    // on all ranks, this one among them, unless FrameConfig::allowPartial is set. The next picture can be made. Waits
+    // for nobody. Throws as start().
     void startFailed(const std::exception_ptr& why, const FrameConfig& frame = {});
 
     // Whether end() would return without waiting; see DistributedFrameBuffer::Frame::isDone(). False without start().
@@ -143,12 +144,13 @@ public:
     }
 
     // Ends the picture. Collective. Waits until it is complete on the display rank, or has failed. Throws FrameError,
-    // the same on all ranks, after which the next picture can be made. Throws TransportError. Throws InvalidArgument
-    // without start(), or on a thread that may not call MPI.
+    // the same on all ranks, after which the next picture can be made; see also FrameConfig::allowPartial. Throws
+    // TransportError. Throws InvalidArgument without start(), or on a thread that may not call MPI.
     FrameReport end();
 
     // The last picture, on the display rank, until the next start(). Empty on other ranks, before the first picture,
-    // and after one that failed. Pixels that no image has show FrameConfig::background, at a depth of +infinity.
+    // and after one for which end() threw. Pixels that no image has show FrameConfig::background, at a depth of
+    // +infinity.
     const Image& image() const noexcept { return engine_->image(); }
 
     // As DistributedFrameBuffer::imageOnAllRanks(), between pictures.
@@ -269,8 +271,9 @@ public:
     InputPixels find(View& view, Converted& converted) const
     {
         const std::ptrdiff_t rowPixels = image_.rowPixels != 0 ? image_.rowPixels : held_.width();
-        const int row = (isFlipped_ ? height_ - 1 - view.region.y0 : view.region.y0) - held_.y0;
-        const std::ptrdiff_t first = row * rowPixels + (view.region.x0 - held_.x0);
+        const std::ptrdiff_t row =
+            std::ptrdiff_t{isFlipped_ ? height_ - 1 - view.region.y0 : view.region.y0} - held_.y0;
+        const std::ptrdiff_t first = row * rowPixels + (std::ptrdiff_t{view.region.x0} - held_.x0);
         view.valid = valid_;
         view.stride = isFlipped_ ? -rowPixels : rowPixels;
         view.color8 = image_.rgba8 ? image_.rgba8 + 4 * first : nullptr;

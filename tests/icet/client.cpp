@@ -236,10 +236,32 @@ void draw(const IceTDouble*, const IceTDouble*, const IceTFloat*, const IceTInt*
         expectError(ICET_INVALID_OPERATION, "a copied state within a frame");
         icetDestroyContext(icetGetContext());
         expectError(ICET_INVALID_OPERATION, "the end of a context within a frame");
+        expect(!icetCreateContext(nullptr), "a context within a frame");
+        expectError(ICET_INVALID_OPERATION, "a context within a frame");
     }
     const Picture picture(40, 30);
     std::copy(picture.colors.begin(), picture.colors.end(), icetImageGetColorui(image));
     std::copy(picture.depths.begin(), picture.depths.end(), icetImageGetDepthf(image));
+}
+
+// Copies of an image of floats in other formats. Its first pixel is 0.5 in all channels.
+void tryCopies(IceTImage image, int channels)
+{
+    const auto count = static_cast<std::size_t>(icetImageGetNumPixels(image));
+    std::vector<float> rgba(4 * count);
+    icetImageCopyColorf(image, rgba.data(), ICET_IMAGE_COLOR_RGBA_FLOAT);
+    expectError(ICET_NO_ERROR, "a copy as RGBA");
+    expect(rgba[0] == 0.5f && rgba[2] == 0.5f && rgba[3] == (channels == 3 ? 1.0f : 0.5f), "a copy as RGBA");
+    std::vector<IceTUByte> bytes(4 * count);
+    icetImageCopyColorub(image, bytes.data(), ICET_IMAGE_COLOR_RGBA_UBYTE);
+    expectError(ICET_NO_ERROR, "a copy as bytes");
+    expect(bytes[0] == 127 && bytes[2] == 127 && bytes[3] == (channels == 3 ? 255 : 127), "a copy as bytes");
+#if defined(ICET_IMAGE_COLOR_RGB_FLOAT)
+    std::vector<float> rgb(3 * count);
+    icetImageCopyColorf(image, rgb.data(), ICET_IMAGE_COLOR_RGB_FLOAT);
+    expectError(ICET_NO_ERROR, "a copy as RGB");
+    expect(rgb[0] == 0.5f && rgb[2] == 0.5f, "a copy as RGB");
+#endif
 }
 
 // The client may render less than a tile: the rest of the tile stays empty.
@@ -268,6 +290,16 @@ void trySmallRender()
         for (int i = 0; i < 40 * 30; ++i)
             expect(icetImageGetColorf(image)[channels * i] == (i % 40 < 8 && i / 40 < 4 ? 0.5f : 0.0f),
                    "pixel " + std::to_string(i) + " of a small render");
+    if (rank == 0)
+        tryCopies(image, channels);
+    icetDrawCallback([](const IceTDouble*, const IceTDouble*, const IceTFloat*, const IceTInt*, IceTImage) {
+        expect(false, "a render that shows nothing");
+    });
+    icetBoundingBoxf(0.5f, 1, -1, 1, 0, 0);
+    expect(icetImageIsNull(icetDrawFrame(identity, identity, black)) == (rank != 0), "a picture of nothing");
+    expectError(ICET_NO_ERROR, "a picture of nothing");
+    icetBoundingVertices(0, ICET_VOID, 0, 0, nullptr);
+    icetDrawCallback(draw);
     icetPhysicalRenderSize(40, 30);
     icetSetColorFormat(ICET_IMAGE_COLOR_RGBA_UBYTE);
     expectGoodFrame("a small render");

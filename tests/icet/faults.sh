@@ -93,7 +93,7 @@ while IFS='|' read -r name file old new; do
     [ "$isCheck" ] || cp "$source/examples/adapters/icet/$file" "$target"
 done <<'END'
 order of the ranks ignored|composite.cpp|if (s.isEnabled(ICET_ORDERED_COMPOSITE))|if (false)
-8-bit background not rounded down|composite.cpp|value = std::floor(255 * std::clamp(value, 0.0f, 1.0f)) / 255;|value = std::clamp(value, 0.0f, 1.0f);
+8-bit background not rounded down|composite.cpp|value = static_cast<float>(levelOf(value)) / 255;|value = std::clamp(value, 0.0f, 1.0f);
 no background behind nearest pixels|composite.cpp|plan.fillsBackground = hasColor &&|plan.fillsBackground = false &&
 depth of nothing is infinite|composite.cpp|return depth == nothing ? 1.0f : depth;|return depth;
 pixels at depth 1 count|composite.cpp|input.farDepth = 1;|

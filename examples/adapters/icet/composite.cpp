@@ -32,7 +32,7 @@ std::array<float, 4> backgroundOf(const IceTContextStruct& context)
     std::array<float, 4> color = context.frame.background;
     if (context.settings.colorFormat == ICET_IMAGE_COLOR_RGBA_UBYTE)
         for (float& value : color)
-            value = std::floor(255 * std::clamp(value, 0.0f, 1.0f)) / 255;
+            value = static_cast<float>(levelOf(value)) / 255;
     return color;
 }
 

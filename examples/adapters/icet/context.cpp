@@ -122,7 +122,7 @@ std::vector<int> gatherColors(const IceTContextStruct& context, int color)
         if (timeLimit().count() > 0 && secondsNow() > limit) {
             gather.release(); // MPI may still write there
             throw Error(ICET_INVALID_OPERATION, "some ranks have not come here: they have left out this call, or only "
-                                                "some ranks have changed tiles, formats or mode");
+                                                "some ranks have changed tiles, formats, mode or background");
         }
     return gather->all;
 }
@@ -156,7 +156,11 @@ std::chrono::milliseconds timeLimit()
 
 extern "C" IceTContext icetCreateContext(IceTCommunicator communicator)
 {
-    return guarded("icetCreateContext", [&] { return current = new IceTContextStruct(mpiOf(communicator)); });
+    return guarded("icetCreateContext", [&] {
+        if (current)
+            requireNotDrawing(*current);
+        return current = new IceTContextStruct(mpiOf(communicator));
+    });
 }
 
 extern "C" void icetDestroyContext(IceTContext context)

@@ -87,7 +87,8 @@ public:
         const Frame& frame = context_.frame;
         const Region& tile = context_.settings.tiles[static_cast<std::size_t>(index)].viewport;
         const Window window = windowFor(context_, tile);
-        if (std::find(frame.tiles.begin(), frame.tiles.end(), index) == frame.tiles.end()) {
+        // icetPhysicalRenderSize() may be so small that the window shows nothing of this rank.
+        if (window.part.empty() || std::find(frame.tiles.begin(), frame.tiles.end(), index) == frame.tiles.end()) {
             if (context_.settings.isEnabled(ICET_RENDER_EMPTY_IMAGES))
                 render(viewport(tile.x0, tile.y0, window.shown.width(), window.shown.height()), {}, false);
             return {};

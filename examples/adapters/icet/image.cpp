@@ -40,14 +40,20 @@ void* Image::writableColor()
 const float* addAlpha(const float* rgb, const dfb::Region& part, int width, int height, std::vector<float>& memory)
 {
     memory.resize(4 * static_cast<std::size_t>(width) * static_cast<std::size_t>(height));
-    for (int y = part.y0; y < part.y1; ++y)
-        for (int x = part.x0; x < part.x1; ++x) {
-            const std::size_t at =
-                static_cast<std::size_t>(y) * static_cast<std::size_t>(width) + static_cast<std::size_t>(x);
-            std::copy_n(rgb + 3 * at, 3, memory.data() + 4 * at);
-            memory[4 * at + 3] = 1;
-        }
+    for (int y = part.y0; y < part.y1; ++y) {
+        const std::size_t at =
+            static_cast<std::size_t>(y) * static_cast<std::size_t>(width) + static_cast<std::size_t>(part.x0);
+        addAlpha(rgb + 3 * at, static_cast<std::size_t>(part.width()), memory.data() + 4 * at);
+    }
     return memory.data();
+}
+
+void addAlpha(const float* rgb, std::size_t pixels, float* out)
+{
+    for (std::size_t i = 0; i < pixels; ++i) {
+        std::copy_n(rgb + 3 * i, 3, out + 4 * i);
+        out[4 * i + 3] = 1;
+    }
 }
 
 void dropAlpha(const float* rgba, std::size_t pixels, float* out)
@@ -88,21 +94,22 @@ Image& withDepth(IceTImage image)
     return *imageOf(image);
 }
 
-// Rounds down to a level, as IceT does.
-IceTUByte levelOf(float value) { return static_cast<IceTUByte>(255 * std::clamp(value, 0.0f, 1.0f)); }
-
 void copyBytes(const IceTImage image, IceTUByte* out, IceTEnum format)
 {
     if (format != ICET_IMAGE_COLOR_RGBA_UBYTE)
         throw Error(ICET_INVALID_ENUM, "the color format is not of type ubyte");
-    if (icetImageGetColorFormat(image) != ICET_IMAGE_COLOR_RGBA_FLOAT) {
+    const IceTEnum own = icetImageGetColorFormat(image);
+    if (!isFloat(own)) {
         const Image& from = withBytes(image);
         std::memcpy(out, from.color, 4 * from.pixelCount());
         return;
     }
     const Image& from = withFloats(image);
     const auto* values = static_cast<const float*>(from.color);
-    std::transform(values, values + 4 * from.pixelCount(), out, levelOf);
+    const std::size_t channels = colorBytes(own) / sizeof(float);
+    for (std::size_t i = 0; i < from.pixelCount(); ++i)
+        for (std::size_t c = 0; c < 4; ++c)
+            out[4 * i + c] = c < channels ? levelOf(values[channels * i + c]) : 255;
 }
 
 void copyFloats(const IceTImage image, IceTFloat* out, IceTEnum format)
@@ -115,8 +122,17 @@ void copyFloats(const IceTImage image, IceTFloat* out, IceTEnum format)
         std::memcpy(out, from.color, colorBytes(own) * from.pixelCount());
         return;
     }
-    const Image& from = withBytes(image);
     const std::size_t channels = colorBytes(format) / sizeof(float);
+    if (isFloat(own)) {
+        const Image& from = withFloats(image);
+        const auto* values = static_cast<const float*>(from.color);
+        if (channels == 4)
+            addAlpha(values, from.pixelCount(), out);
+        else
+            dropAlpha(values, from.pixelCount(), out);
+        return;
+    }
+    const Image& from = withBytes(image);
     const auto* levels = static_cast<const IceTUByte*>(from.color);
     for (std::size_t i = 0; i < from.pixelCount(); ++i)
         for (std::size_t c = 0; c < channels; ++c)

@@ -4,6 +4,7 @@
 #include <IceT.h>
 #include <dfb/image.hpp>
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
@@ -12,6 +13,12 @@ namespace dfb_icet {
 
 // Bytes of a pixel. Throws Error if there is no such format.
 std::size_t colorBytes(IceTEnum format);
+
+// Rounds down to a level, as IceT does. A value that is not a number is 0.
+inline std::uint8_t levelOf(float value)
+{
+    return static_cast<std::uint8_t>(255 * std::min(std::max(0.0f, value), 1.0f));
+}
 
 struct Image {
     IceTEnum colorFormat = ICET_IMAGE_COLOR_NONE, depthFormat = ICET_IMAGE_DEPTH_NONE;
@@ -35,6 +42,8 @@ struct Image {
 
 // Returns the part of an image of RGB floats as RGBA with alpha 1, in `memory`, which gets the size of the image.
 const float* addAlpha(const float* rgb, const dfb::Region& part, int width, int height, std::vector<float>& memory);
+// Here alpha is 1, too.
+void addAlpha(const float* rgb, std::size_t pixels, float* out);
 // `out` may be the same memory as `rgba`.
 void dropAlpha(const float* rgba, std::size_t pixels, float* out);
 

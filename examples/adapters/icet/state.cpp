@@ -37,8 +37,7 @@ Values numbers(const Range& range)
 double wordOf(const std::array<float, 4>& color)
 {
     std::uint8_t bytes[4];
-    for (std::size_t c = 0; c < 4; ++c)
-        bytes[c] = static_cast<std::uint8_t>(255 * color[c]);
+    std::transform(color.begin(), color.end(), bytes, levelOf);
     std::int32_t word = 0;
     std::memcpy(&word, bytes, sizeof word);
     return word;
