@@ -164,8 +164,9 @@ public:
                 const int tileCount = tiles_.table().layout().tileCount();
                 if (!verdict.fits(tileCount))
                     failMalformed("a verdict on tiles that there are not", tileCount - 1);
-                // A rank that votes with an error has told all others why, except in a frame that may be partial.
-                const bool isCause = verdict.error && !terms_.allowPartial;
+                // A rank that votes with an error has told all others why; in a frame that may be partial only if it
+                // could not make its parameters.
+                const bool isCause = verdict.error && (!terms_.allowPartial || verdict.hasNotBegun);
                 differs = isUp && !isCause && !verdict.terms.difference(terms_).empty();
             } else if (scope == AllDeclared) {
                 if (!mailbox_.bytesOf(message).empty())

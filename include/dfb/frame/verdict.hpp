@@ -336,10 +336,12 @@ struct Verdict {
         // Other errors follow from different parameters. But if a camera throws on one rank, its FrameConfig::order is
         // missing for that reason. Then there is no partial image, either.
         const bool isCause = a.error && (a.hasNotBegun || a.error->kind == ErrorKind::UserCode);
-        if (!a.differing.empty() && isCause && a.terms.allowPartial != 0)
-            a.differing += printed("; rank %d: %s", a.error->rank, a.error->message.c_str());
-        if (!a.differing.empty() && (!isCause || a.terms.allowPartial != 0))
+        const bool isCombined = a.error && a.error->kind == ErrorKind::Disagreement && a.error->rank < 0;
+        if (!a.differing.empty() && !isCombined && (!isCause || a.terms.allowPartial != 0)) {
+            if (isCause)
+                a.differing += printed("; rank %d: %s", a.error->rank, a.error->message.c_str());
             a.error = disagreement(a.differing);
+        }
         using Words = std::array<std::uint64_t, sizeof(Sums) / 8>;
         auto sums = loadAs<Words>(reinterpret_cast<const std::byte*>(&a.sums));
         const auto more = loadAs<Words>(reinterpret_cast<const std::byte*>(&b.sums));

@@ -1694,10 +1694,11 @@ TEST_CASE("A camera that throws on one rank is why a frame fails, also if it may
 {
     const bool isInvalid = GENERATE(false, true);
     const bool isPartial = GENERATE(false, true);
-    std::vector<std::string> texts(3);
-    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+    std::vector<std::string> texts(9);
+    dfb::runRanks(9, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config(128, 64);
         config.executor = std::make_shared<dfb::CallerExecutor>(); // messages are taken in their order
+        config.quiet = std::chrono::milliseconds(50);
         FrameBuffer<dfb::AlphaBlend> fb(communicator, config);
         const auto z = static_cast<float>(fb.rank());
         const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, z}, {1, 1, z}}}});
@@ -1714,11 +1715,14 @@ TEST_CASE("A camera that throws on one rank is why a frame fails, also if it may
     CHECK(allSame(texts));
     CHECK(has(texts[0], "rank 1"));
     CHECK(has(texts[0], "no such eye"));
+    CHECK(texts[0].find("no such eye") == texts[0].rfind("no such eye"));
 }
 
 TEST_CASE("A camera that throws on one rank is why a frame fails, also if its vote overtakes the news", "[errors]")
 {
     using Transport = dfb::testing::FaultTransport<dfb::InprocTransport>;
+    dfb::FrameConfig params;
+    params.allowPartial = GENERATE(false, true);
     dfb::testing::FaultOptions faults;
     faults.delay = 1;
     faults.maxDelay = std::chrono::milliseconds(4);
@@ -1727,14 +1731,18 @@ TEST_CASE("A camera that throws on one rank is why a frame fails, also if its vo
     };
     std::vector<std::string> texts;
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
-        dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, Transport> fb({communicator, faults}, {128, 64});
+        dfb::FrameBufferConfig config(128, 64);
+        config.quiet = std::chrono::milliseconds(20);
+        dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, Transport> fb({communicator, faults}, config);
         const auto z = static_cast<float>(fb.rank());
         const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, z}, {1, 1, z}}}});
         const dfb::SharedWorld all(fb, world);
         dfb::DataParallelLoop loop(fb, world, all);
         for (int frame = 0; frame < 20; ++frame) {
-            std::string text =
-                outcomeOf([&] { loop.render(ThrowingEye(fb.rank() == 1), [](const dfb::Brick&, auto&) {}); });
+            std::string text = outcomeOf([&] {
+                loop.render(
+                    ThrowingEye(fb.rank() == 1), [](const dfb::Brick&, auto&) {}, params);
+            });
             if (fb.rank() == 0)
                 texts.push_back(std::move(text));
         }
