@@ -134,8 +134,10 @@ struct FrameConfig {
     // True: a frame that fails still gives the tiles that were finished. end() then sets FrameReport::failure in place
     // of a FrameError, and DistributedFrameBuffer::isComplete() tells which tiles there are. If a renderer or an
     // operation throws, or inputs of a tile contradict each other, only that tile is lost. A tile with a missing input
-    // is given up when nothing is under way any more, or after `timeout`. If a message cannot be read, the frame ends
-    // at once; with a `timeout` it goes on until then. If ranks disagree about these parameters, end() still throws.
+    // is given up when nothing is under way any more, which takes at least FrameBufferConfig::quiet, or after
+    // `timeout`. An exception that concerns no tile, such as a camera's, takes the frame as long. If a message cannot
+    // be read, the frame ends at once; with a `timeout` it goes on until then. If ranks disagree about these
+    // parameters, end() still throws.
     bool allowPartial = false;
 };
 

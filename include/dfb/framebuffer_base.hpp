@@ -53,7 +53,7 @@ public:
     bool opaqueHides(int tileIndex) const { return engine_->opaqueHides(tileIndex); }
     // Tells `rank` that an input of this rank will probably hide the inputs of `rank` in `generation` and higher
     // ones. `rank` should wait before it renders them. This rank must then call hide() or, if they can be seen,
-    // show(). Throws as hide().
+    // show(). If its own input is hidden as well, it calls hide(). Throws as hide().
     void mayHide(int tileIndex, int generation, int rank) const
     {
         engine_->tell(rank, {tileIndex, generation, detail::HidingWord::MayHide});

@@ -54,7 +54,8 @@ struct RoundRobinBricks {
 class MeasuredCostBricks {
 public:
     // Takes the costs of the frame of this report, and forgets all others. A cost that is not finite counts as not
-    // known. Call it on all ranks, between frames. Sends nothing and waits for nothing.
+    // known. Call it on all ranks, after the same end() and before the same begin(). Sends nothing and waits for
+    // nothing.
     void update(const FrameReport& report)
     {
         costs_.clear();

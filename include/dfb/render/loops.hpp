@@ -364,7 +364,7 @@ public:
     // Frame::start() has cleared the tile. Several threads call renderBrick at once, once for each pass (tile.pass).
     // Unlike in Listing 3, each rank declares its inputs, so owners need not know the bricks. Waits for other ranks
     // only for room, as setTile(). Throws what FrameBuffer::begin() throws. An exception of renderBrick or the camera
-    // comes out of Frame::end() on all ranks, as a FrameError.
+    // comes out of Frame::end() on all ranks, as a FrameError, except where FrameConfig::allowPartial says otherwise.
     template <class Camera, class RenderBrick>
     typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick, FrameConfig params = {},
                                       const typename FrameBuffer::TileFrameData& tileData = {},

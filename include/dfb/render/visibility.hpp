@@ -9,7 +9,8 @@
 //   std::optional<Vec3> commonEye() const;
 // the point where all its rays begin, if there is one: then AlphaBlend need not sort (FrameConfig::order). Parallel
 // rays come from a point at infinity: each coordinate is +-infinity, or NaN if the rays are perpendicular to that axis.
-// Loops call both on the thread that is in start(); if they throw, the frame fails on all ranks.
+// Loops call both on the thread that is in start(); if they throw, the frame fails on all ranks. A partial
+// frame then lacks tiles, or fails as well: see docs/errors.md.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
